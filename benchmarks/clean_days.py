@@ -39,8 +39,8 @@ from feeders.profiles import Season, library
 from feeders.simulation.scenario import START, Scenario, SimulatedReading, simulate
 from gridsec.arrays import Floats
 from gridsec.interface import Decision
-from service.alarms.alarm import Change
 from service.alarms.conditions import AlarmKind
+from service.alarms.state_machine import Change
 from service.engine.feeder_monitor import TickResult
 from service.engine.replay import ReplayCounts, replay
 

@@ -11,9 +11,15 @@ from typing import Annotated
 from pydantic import ConfigDict, Field, JsonValue, with_config
 
 from gridsec.interface import Cause, Decision
-from service.report.reasons import DataErrorReport
-from service.report.report import ExplanationReport, FeederReport, MeterState, StalledMeter, finite
-from service.report.voltages import BUSBAR
+from service.report.report import (
+    BUSBAR,
+    DataErrorReport,
+    ExplanationReport,
+    FeederReport,
+    MeterState,
+    StalledMeter,
+    finite,
+)
 
 
 class AlarmKind(StrEnum):

@@ -1,4 +1,4 @@
-"""Errors as `application/problem+json` (RFC 9457), and request checks before the HTTP application."""
+"""HTTP conventions of all routes: `application/problem+json` (RFC 9457), request checks, HEAD as GET."""
 
 from __future__ import annotations
 
@@ -22,6 +22,40 @@ from service.alarms.state_machine import AlarmUnknown, AlreadyAcknowledged, Rais
 from service.engine.commissioning import NothingToLearn
 from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, TooManyFeeders
 from service.store import OutcomeUnknown, StoreUnavailable
+
+
+class _HeadersSent(Exception):
+    """Ends a stream after its headers."""
+
+
+class HeadAsGet:
+    """Answers HEAD with the status and headers of GET. A stream ends after its headers."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request to the application."""
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await self.app(scope, receive, send)
+            return
+
+        async def headers_only(message: Message) -> None:
+            if message["type"] != "http.response.body":
+                await send(message)
+                return
+            await send({"type": "http.response.body", "body": b"", "more_body": False})
+            if message.get("more_body"):
+                raise _HeadersSent
+
+        try:
+            await self.app({**scope, "method": "GET"}, receive, headers_only)
+        except* _HeadersSent:  # alone, or in a group of the stream's tasks
+            pass
+
+
+# --- Problems and request checks ---
+
 
 _CSP = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "

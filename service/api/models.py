@@ -18,8 +18,7 @@ from service.access.audit import AuditEntry
 from service.access.identity import Role
 from service.alarms.state_machine import Alarm
 from service.engine.commissioning import CommissioningProgress, MeterCommissioning
-from service.report.report import FeederReport, MeterState
-from service.report.voltages import ModelOnly
+from service.report.report import FeederReport, MeterState, ModelOnly
 from service.store import AlarmEvent
 from service.store.schema import CommissioningEvent
 

@@ -32,13 +32,11 @@ from service.access.identity import OPEN, POLICY, PUBLIC, Identity, NotPermitted
 from service.alarms.state_machine import Alarm, AlarmKind, AlarmState, AlarmUnknown, Severity
 from service.api import models, tables
 from service.api.access import COOKIE, FRESH_S, Authenticator, authorise, client_of, session_of
-from service.api.conventions import HeadAsGet
 from service.api.description import BODY, TAGS, feeder_schemas
-from service.api.errors import Guard, handlers, problem
+from service.api.errors import Guard, HeadAsGet, handlers, problem
 from service.engine.commissioning import CommissioningProgress
 from service.errors import FeederNotLoaded, FeederUnknown
-from service.report.report import FeederReport
-from service.report.voltages import BUSBAR
+from service.report.report import BUSBAR, FeederReport
 from service.settings import is_loopback
 from service.store import AlarmEvent, Store, StoreUnavailable
 

@@ -386,7 +386,7 @@ class _Lie:
 def _lie(text: str) -> _Lie:
     """Parse `kind:count:size:from:to`."""
     from feeders.simulation.attacks import RANDOM_KINDS, AttackKind, no_size
-    from service.report.voltages import BUSBAR
+    from service.report.report import BUSBAR
 
     try:
         name, count, size, begin, end = text.split(":")

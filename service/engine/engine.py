@@ -38,13 +38,20 @@ from service.alarms.state_machine import (
 )
 from service.alarms.state_machine import to_json as alarm_json
 from service.engine.commissioning import CommissioningProgress, FeederCommissioning
-from service.engine.feeder_monitor import FeederMonitor, TickResult, align_rules, known_of
-from service.engine.suspicions import Suspicions
+from service.engine.feeder_monitor import FeederMonitor, Suspicions, TickResult, align_rules, known_of
 from service.errors import FeederUnknown
 from service.ingest.align import Clock, ReadingOutcome
-from service.ingest.decode import DecodedPayload, Wire
 from service.ingest.queues import Sample
-from service.ingest.reading import HEAD_BYTES, BadReading, BadReason, Reading, beginning, head_of
+from service.ingest.reading import (
+    HEAD_BYTES,
+    BadReading,
+    BadReason,
+    DecodedPayload,
+    Reading,
+    Wire,
+    beginning,
+    head_of,
+)
 from service.metrics import Metrics
 from service.report.report import FeederReport, to_text
 from service.store import Rejected, Store

@@ -12,8 +12,7 @@ from feeders.simulation.scenario import SimulatedReading as Recorded
 from gridsec.interface import Decision
 from service.alarms.state_machine import AlarmBook
 from service.engine.commissioning import FeederCommissioning
-from service.engine.feeder_monitor import FeederMonitor, TickResult, align_rules, design, known_of
-from service.engine.suspicions import Suspicions
+from service.engine.feeder_monitor import FeederMonitor, Suspicions, TickResult, align_rules, design, known_of
 from service.ingest.align import Clock, ReadingOutcome
 from service.ingest.reading import T_MAX, T_MIN, BadReason, Findings, Known, Reading, judge, to_reading
 from service.store.state_codec import StateSnapshot

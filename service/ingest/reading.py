@@ -1,19 +1,40 @@
-"""Readings: validation of values, with all problems of a reading.
+"""Readings: decoding of payloads and validation of values.
 
 A value is checked as a whole: a `BadReading` lists every problem of the reading at once. The reason is one of
 a few words (a label for counters), the problems are sentences (for operators).
+
+Arrow is designed for trusted data: a small payload can expand to a huge table (compressed buffers, null or
+dictionary columns), and unchecked offsets point outside of the buffers. Only plain, uncompressed columns are
+read, after full validation.
+
+The decoder raises no error on data. An unusable payload, or element of a batch, becomes a `BadReading` with
+all its problems; the good elements of a batch are used. The reason is one of a few words (a label for
+counters), the problems are sentences (for operators).
+
+The zenoh encoding gives the format: JSON (also without an encoding), and for concentrators the same fields as
+columns in CBOR (a map of arrays of equal length) or Arrow IPC (stream or file, uncompressed).
 """
 
 from __future__ import annotations
 
+import json
 import math
 import reprlib
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import struct
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import partial
+from itertools import chain
 from typing import Any
 
+import cbor2
 import msgspec
+import pyarrow as pa
+from pyarrow import ipc
+
+from service.access.signing import MeterKeys, Refusal
 
 T_MIN, T_MAX = 1e8, 1e10
 """Range of Unix times, s (1973 to 2286); values outside are milliseconds, counters or uptimes."""
@@ -290,3 +311,420 @@ def head_of(value: object) -> str:
         return beginning(_BRIEF.repr(value))
     except (ValueError, RecursionError):  # an integer of thousands of digits, or a value that contains itself
         return name_of(value)
+
+
+# --- Payloads ---
+
+
+_RECORD_BATCH_COMPRESSION_SLOT = 3
+_MESSAGE_HEADER_SLOT = 2
+_UNREADABLE = (
+    pa.ArrowException,
+    OSError,
+    EOFError,
+    ValueError,
+    TypeError,
+    LookupError,
+    OverflowError,
+    MemoryError,
+    struct.error,
+)
+
+
+class ArrowProblem(ValueError):
+    """A payload cannot be read.
+
+    problems: one sentence for each problem.
+    well_formed: True for valid Arrow IPC.
+    """
+
+    def __init__(self, problems: Iterable[str], *, well_formed: bool) -> None:
+        self.problems = tuple(problems)
+        self.well_formed = well_formed
+        super().__init__("; ".join(self.problems))
+
+
+def columns_of(payload: bytes, is_file: bool, names: tuple[str, ...]) -> dict[str, list[Any]]:
+    """Return the named columns of an Arrow IPC stream or file as Python lists, nulls as None.
+
+    With `is_file` the payload has the file format (with a footer). Absent columns are left out of the result.
+    Raises ArrowProblem if the payload is not Arrow IPC, is compressed, or a requested column is not a plain
+    column of strings (`meter`), integers (`seq`) or numbers (all others).
+    """
+    try:
+        reader = _open(payload, is_file)
+        _check_columns(reader.schema, names)
+        columns: dict[str, list[Any]] = {name: [] for name in names if name in reader.schema.names}
+        for batch in _batches(reader, limit=len(payload)):
+            batch.validate(full=True)
+            for name, column in columns.items():
+                column.extend(batch.column(name).to_pylist())
+    except ArrowProblem:
+        raise
+    except _UNREADABLE as error:
+        detail = str(error).partition("\n")[0] or type(error).__name__
+        raise ArrowProblem([f"not Arrow IPC: {detail}"], well_formed=False) from error
+    return columns
+
+
+def _open(payload: bytes, is_file: bool) -> Any:
+    if is_file:
+        # The file format wraps the messages of a stream between two magic words: the check for compression
+        # works for both. Reading from front to back does not need the footer.
+        if payload[:6] != b"ARROW1" or payload[-6:] != b"ARROW1":
+            raise pa.ArrowInvalid("not an Arrow file")
+        payload = payload[8:]
+    _refuse_compression(payload)
+    return ipc.open_stream(pa.py_buffer(payload))
+
+
+def _refuse_compression(payload: bytes) -> None:
+    source = pa.BufferReader(payload)
+    while True:
+        try:
+            message = ipc.read_message(source)
+        except EOFError:
+            return
+        if message.type == "record batch" and _is_compressed(message.metadata.to_pybytes()):
+            raise ArrowProblem(
+                ["compressed Arrow IPC is not supported; write it uncompressed"], well_formed=True
+            )
+        if message.type == "dictionary":
+            raise ArrowProblem(
+                ["dictionary columns are not supported; write plain strings"], well_formed=True
+            )
+
+
+def _is_compressed(metadata: bytes) -> bool:
+    """True if a record batch's flatbuffer header has its `compression` field set."""
+    message = struct.unpack_from("<I", metadata, 0)[0]
+    header = _slot(metadata, message, _MESSAGE_HEADER_SLOT)
+    if header == 0:
+        return False
+    batch = header + struct.unpack_from("<I", metadata, header)[0]
+    return _slot(metadata, batch, _RECORD_BATCH_COMPRESSION_SLOT) != 0
+
+
+def _slot(data: bytes, table: int, index: int) -> int:
+    """Return the position of field `index` of a flatbuffer table, 0 if absent."""
+    vtable = table - struct.unpack_from("<i", data, table)[0]
+    size = struct.unpack_from("<H", data, vtable)[0]
+    entry = 4 + 2 * index
+    if entry >= size:
+        return 0
+    offset = struct.unpack_from("<H", data, vtable + entry)[0]
+    return table + offset if offset else 0
+
+
+def _check_columns(schema: pa.Schema, names: tuple[str, ...]) -> None:
+    problems = []
+    for name in names:
+        count = schema.names.count(name)
+        if count > 1:
+            problems.append(f"column `{name}` appears {count} times")
+        if count != 1:
+            continue
+        kind = schema.field(name).type
+        if name == "meter":
+            good = pa.types.is_string(kind) or pa.types.is_large_string(kind)
+        elif name == "seq":
+            good = pa.types.is_integer(kind)
+        else:
+            good = pa.types.is_integer(kind) or pa.types.is_floating(kind)
+        if not good:
+            problems.append(f"column `{name}` has type {kind}")
+    if problems:
+        raise ArrowProblem(problems, well_formed=True)
+
+
+def _batches(reader: Any, limit: int) -> Iterable[Any]:
+    rows = 0
+    for batch in reader:
+        rows += batch.num_rows
+        # A row takes at least one byte, otherwise its length is false (a column without buffers).
+        if rows > limit:
+            raise ArrowProblem([f"more than {limit} rows in {limit} bytes"], well_formed=True)
+        yield batch
+
+
+JSON_ENCODINGS = frozenset({"", "zenoh/bytes", "zenoh/string", "text/plain", "application/json", "text/json"})
+DETAILED_PER_REASON = 5
+"""Largest number of bad elements of one batch and reason that are reported in full; the others are counted.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class DecodedPayload:
+    """Readings and bad readings of one payload."""
+
+    readings: tuple[Reading, ...] = ()
+    bad: tuple[BadReading, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Source of a payload: a feeder, and a meter, the busbar (meter None) or a concentrator."""
+
+    feeder: str
+    meter: str | None = None
+    concentrator: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Wire:
+    """The decoder of one service."""
+
+    known: Mapping[str, Known]  # the monitored feeders, by name
+    prefix: str = "gridsec"  # first chunks of every key, without a final slash
+    max_bytes: int = 256 * 1024  # size of the largest accepted payload, bytes
+    keys: MeterKeys | None = None  # keys of meters; None accepts readings without signature
+
+    def decode(
+        self,
+        key: str,
+        payload: bytes,
+        encoding: str = "",
+        *,
+        size: int | None = None,
+        attachment: bytes = b"",
+    ) -> DecodedPayload:
+        """Return the readings and the bad readings in one payload.
+
+        `size` is the length of the whole payload, bytes, if `payload` is only its beginning. A schema after
+        `;` in the encoding is ignored. The result is never empty: a payload without readings is a
+        bad reading.
+        """
+        source = source_of(key, self.prefix, self.known)
+        head = head_of(payload[:HEAD_BYTES])
+        if isinstance(source, BadReading):
+            return DecodedPayload(bad=(replace(source, head=head),))
+        base = BadReading(BadReason.SYNTAX, (), beginning(key), source.feeder, source.meter, head)
+        length = len(payload) if size is None else size
+        if length > self.max_bytes:
+            problem = f"payload of {length} bytes; at most {self.max_bytes} are read"
+            return _refuse(base, BadReason.OVERSIZE, problem)
+        if not payload:
+            return _refuse(base, BadReason.EMPTY, "the payload is empty")
+        decoder = _decoder(encoding.partition(";")[0].strip().lower(), source)
+        if decoder is None:
+            accepted = "application/json" if source.concentrator is None else "JSON, CBOR or Arrow IPC"
+            problem = f"encoding `{encoding[:80]}` is not supported; use {accepted}"
+            return _refuse(base, BadReason.ENCODING, problem)
+        decoded = decoder(payload, source, self.known[source.feeder], base)
+        if self.keys is None:
+            return decoded
+        check = partial(self.keys.check, key=key, payload=payload, attachment=attachment)
+        return _verified(decoded, check, base)
+
+
+def _verified(
+    decoded: DecodedPayload, check: Callable[[str, str | None], Refusal | None], base: BadReading
+) -> DecodedPayload:
+    """Move readings that their keys refuse to the bad ones."""
+    accepted: list[Reading] = []
+    bad = list(decoded.bad)
+    more: Counter[BadReason] = Counter()
+    for reading in decoded.readings:
+        refusal = check(reading.feeder, reading.meter)
+        if refusal is None:
+            accepted.append(reading)
+            continue
+        reason = BadReason(refusal.reason)
+        more[reason] += 1
+        if more[reason] <= DETAILED_PER_REASON:
+            bad.append(replace(base, reason=reason, problems=(refusal.problem,), meter=reading.meter))
+    for reason, count in more.items():
+        if (rest := count - DETAILED_PER_REASON) > 0:
+            problem = f"{rest} more elements of the batch: {reason}"
+            bad.append(replace(base, reason=reason, problems=(problem,), count=rest))
+    return DecodedPayload(tuple(accepted), tuple(bad))
+
+
+def _decoder(
+    kind: str, source: Source
+) -> Callable[[bytes, Source, Known, BadReading], DecodedPayload] | None:
+    if kind in JSON_ENCODINGS:
+        return _single if source.concentrator is None else _json_batch
+    if source.concentrator is not None:
+        return _BATCH_DECODERS.get(kind)
+    return None
+
+
+def source_of(key: str, prefix: str, known: Mapping[str, Known]) -> Source | BadReading:
+    """Return the source that a key denotes, or a bad reading with the reason.
+
+    Keys are `<prefix>/<feeder>/meter/<meter>/reading`, `<prefix>/<feeder>/substation/reading` and
+    `<prefix>/<feeder>/concentrator/<id>/readings`.
+    """
+    if "*" in key or "$" in key:
+        return _nowhere(key, BadReason.KEY, "is a pattern; a reading needs a key without wildcards")
+    head, _, rest = key.partition(prefix + "/")
+    match rest.split("/"):
+        case [feeder, "meter", meter, "reading"] if not head:
+            source = Source(feeder, meter)
+        case [feeder, "substation", "reading"] if not head:
+            source = Source(feeder)
+        case [feeder, "concentrator", concentrator, "readings"] if not head:
+            source = Source(feeder, None, concentrator)
+        case _:
+            return _nowhere(key, BadReason.KEY, "is not the key of a reading")
+    limits = known.get(source.feeder)
+    if limits is None:
+        return _nowhere(key, BadReason.UNKNOWN_FEEDER, "is the key of a feeder that is not monitored here")
+    if source.meter is not None and source.meter not in limits.meters:
+        bad = _nowhere(key, BadReason.UNKNOWN_METER, "is the key of a meter that the feeder does not have")
+        return replace(bad, feeder=source.feeder)
+    return source
+
+
+def _nowhere(key: str, reason: BadReason, why: str) -> BadReading:
+    shown = beginning(key)
+    return BadReading(reason, (f"`{shown}` {why}",), shown)
+
+
+def _refuse(base: BadReading, reason: BadReason, *problems: str) -> DecodedPayload:
+    return DecodedPayload(bad=(replace(base, reason=reason, problems=tuple(map(printable, problems))),))
+
+
+# ---------------------------------------------------------------------------------------------------------
+# JSON
+
+
+_decode_one = msgspec.json.Decoder(WireReading).decode
+_decode_many = msgspec.json.Decoder(list[WireReading]).decode
+
+
+def _parse(payload: bytes) -> Any:
+    """Parse JSON; NaN and infinities are accepted here and reported by field."""
+    try:
+        return msgspec.json.decode(payload)
+    except msgspec.ValidationError:
+        return json.loads(payload)
+    except msgspec.DecodeError as error:
+        try:
+            return json.loads(payload)
+        except ValueError:
+            raise error from None
+
+
+def _single(payload: bytes, source: Source, known: Known, base: BadReading) -> DecodedPayload:
+    try:
+        raw = _decode_one(payload)
+    except (msgspec.MsgspecError, RecursionError):
+        pass
+    else:
+        if plausible(raw, known, source.meter):
+            return DecodedPayload((to_reading(source.feeder, source.meter, raw),))
+    try:
+        value = _parse(payload)
+    except (ValueError, RecursionError, msgspec.MsgspecError) as error:
+        return _refuse(base, BadReason.SYNTAX, f"not JSON: {error}")
+    if value in ([], {}):
+        return _refuse(base, BadReason.EMPTY, "the reading is empty")
+    found = judge(value, known, source.meter, in_batch=False)
+    if isinstance(found, WireReading):
+        return DecodedPayload((to_reading(source.feeder, source.meter, found),))
+    return _refuse(base, found.reason, *found.problems)
+
+
+def _json_batch(payload: bytes, source: Source, known: Known, base: BadReading) -> DecodedPayload:
+    try:
+        rows = _decode_many(payload)
+    except (msgspec.MsgspecError, RecursionError):
+        pass
+    else:
+        if rows and all(plausible(raw, known, raw.meter) and raw.meter in known.meters for raw in rows):
+            return DecodedPayload(tuple(to_reading(source.feeder, raw.meter, raw) for raw in rows))
+    try:
+        value = _parse(payload)
+    except (ValueError, RecursionError, msgspec.MsgspecError) as error:
+        return _refuse(base, BadReason.SYNTAX, f"not JSON: {error}")
+    if not isinstance(value, list):
+        return _refuse(base, BadReason.TYPE, f"expected a JSON array of readings, not {name_of(value)}")
+    return _batch(value, source, known, base)
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Columns
+
+
+_FIELDS = ("meter", "t", "v_volt", "p_kw", "q_kvar", "seq", "t_power")
+
+
+def _cbor(payload: bytes, source: Source, known: Known, base: BadReading) -> DecodedPayload:
+    try:
+        columns = cbor2.loads(payload)
+    except (
+        cbor2.CBORDecodeError,
+        ValueError,
+        OverflowError,
+        RecursionError,
+        MemoryError,
+        TypeError,
+    ) as error:
+        return _refuse(base, BadReason.SYNTAX, f"not CBOR: {error}")
+    if not isinstance(columns, dict):
+        return _refuse(base, BadReason.TYPE, f"expected a CBOR map of columns, not {name_of(columns)}")
+    return _columns(columns, source, known, base)
+
+
+def _arrow(
+    payload: bytes, source: Source, known: Known, base: BadReading, *, is_file: bool
+) -> DecodedPayload:
+    try:
+        columns = columns_of(payload, is_file, _FIELDS)
+    except ArrowProblem as error:
+        reason = BadReason.TYPE if error.well_formed else BadReason.SYNTAX
+        return _refuse(base, reason, *error.problems)
+    return _columns(columns, source, known, base)
+
+
+_BATCH_DECODERS: Mapping[str, Callable[[bytes, Source, Known, BadReading], DecodedPayload]] = {
+    "application/cbor": _cbor,
+    "application/vnd.apache.arrow.stream": partial(_arrow, is_file=False),
+    "application/vnd.apache.arrow.file": partial(_arrow, is_file=True),
+}
+
+
+def _columns(columns: Mapping[Any, Any], source: Source, known: Known, base: BadReading) -> DecodedPayload:
+    present = {name: columns[name] for name in _FIELDS if name in columns}
+    problems = [
+        f"column `{name}` is {name_of(column)}, not an array"
+        for name, column in present.items()
+        if not isinstance(column, list)
+    ]
+    problems += [f"column `{name}` is missing" for name in ("meter", "t", "v_volt") if name not in present]
+    if problems:
+        return _refuse(base, BadReason.TYPE, *problems)
+    lengths = {name: len(column) for name, column in present.items()}
+    if len(set(lengths.values())) > 1:
+        listed = ", ".join(f"`{name}` {length}" for name, length in lengths.items())
+        return _refuse(base, BadReason.TYPE, f"the columns differ in length: {listed}")
+    rows = [dict(zip(present, row, strict=True)) for row in zip(*present.values(), strict=True)]
+    return _batch(rows, source, known, base)
+
+
+def _batch(rows: list[Any], source: Source, known: Known, base: BadReading) -> DecodedPayload:
+    if not rows:
+        return _refuse(base, BadReason.EMPTY, "the batch is empty")
+    readings: list[Reading] = []
+    bad: dict[BadReason, list[BadReading]] = {}
+    more: Counter[BadReason] = Counter()
+    for index, row in enumerate(rows):
+        found = judge(row, known, in_batch=True)
+        if isinstance(found, WireReading):
+            readings.append(to_reading(source.feeder, found.meter, found))
+            continue
+        alike = bad.setdefault(found.reason, [])
+        if len(alike) == DETAILED_PER_REASON:
+            more[found.reason] += 1
+            continue
+        meter = row.get("meter") if isinstance(row, dict) else None
+        ours = meter if isinstance(meter, str) and meter in known.meters else None
+        listed = tuple(f"element {index}: {problem}" for problem in found.problems)
+        alike.append(replace(base, reason=found.reason, problems=listed, meter=ours, head=head_of(row)))
+    rest = (
+        replace(base, reason=reason, problems=(f"{count} more elements of the batch: {reason}",), count=count)
+        for reason, count in more.items()
+    )
+    return DecodedPayload(tuple(readings), (*chain.from_iterable(bad.values()), *rest))

@@ -8,33 +8,469 @@ strings and floats, so that it can be stored, compared, sent and read from any t
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Final, Literal, TypeAlias
 
 import numpy as np
+import structlog
 from pydantic import Field, TypeAdapter
 
-from feeders.model.site import Site, volts
+from feeders.model.site import Site, Snapshot, plant, volts
 from gridsec.arrays import Bools, Floats
+from gridsec.estimators import data_errors
+from gridsec.estimators.data_errors import DataError, DataErrorKind
 from gridsec.estimators.sequential import LearningReason, LearningState
-from gridsec.interface import Cause, Decision, Estimate, Verdict
+from gridsec.grid import Feeder
+from gridsec.grid.three_phase import PHASES
+from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
 from service.ingest.align import Tick
-from service.report.reasons import DataErrorReport, reason_of
-from service.report.voltages import (
-    BUSBAR,
-    UNKNOWN_BUSBAR,
-    BusbarMeterState,
-    ClockOffset,
-    ModelOnly,
-    ReferenceVoltages,
-    attack_volts,
-    bus_volts,
-    busbar_phases,
-    busbar_report,
-    grounds,
-    std_volts,
-)
+
+Phase: TypeAlias = Literal["a", "b", "c"]
+
+
+def snapshot(site: Site, tick: Tick) -> Snapshot:
+    """Return a tick's readings in the form of `feeders.model.site.to_frame`."""
+    nan = math.nan
+    rows = [
+        (nan, nan, nan, nan, nan) if r is None else (r.v_volt, r.p_kw, r.q_kvar, r.t, r.t_power)
+        for r in tick.readings
+    ]
+    columns = np.array(rows, dtype=np.float64).reshape(-1, 5)
+    age = columns[:, 3] - columns[:, 4]
+    return Snapshot(
+        t=tick.t,
+        v_volt=columns[:, 0].copy(),
+        p_kw=columns[:, 1].copy(),
+        q_kvar=columns[:, 2].copy(),
+        v0_volt=busbar_volt(site, tick),
+        p_age_s=None if np.isnan(age).all() else age,
+        clock_offset_s=np.array(tick.clock_offset, dtype=np.float64) if any(tick.clock_offset) else None,
+        busbar_offset_s=nan if tick.busbar_offset is None else tick.busbar_offset,
+    )
+
+
+def busbar_volt(site: Site, tick: Tick) -> Floats | float:
+    """Return the reading of the busbar meter, V: one voltage, or in three phases (3,); NaN without one."""
+    if tick.busbar is None:
+        return math.nan
+    phases = tick.busbar.v_phases
+    # A balanced feeder has one voltage, also if single phases are not measured.
+    one = phases is None or site.feeder.busbar_phases == 1
+    return tick.busbar.v_volt if one else np.array(phases)
+
+
+def busbar_phases(site: Site) -> tuple[Phase | None, ...]:
+    """Return the phases of the busbar, (b,): a, b and c, or None on a balanced feeder."""
+    return ("a", "b", "c") if site.feeder.busbar_phases == 3 else (None,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReferenceVoltages:
+    """Voltage readings of one tick that the reconstruction uses, by phase of the busbar, (b,).
+
+    A value without such a reading in its phase is *model only*: it follows from powers, the model and the
+    state of the estimator. All buses of a phase are connected, so that one reading counts for all of them.
+    """
+
+    meters: Bools  # (b,): At least one meter of the phase reports and is trusted
+    busbar: Bools  # (b,): The busbar's meter reports the phase and is not named as manipulated
+
+    @property
+    def measured(self) -> Bools:
+        """Phases with at least one reading, (b,)."""
+        return self.meters | self.busbar
+
+    def model_only(self, site: Site) -> Bools:
+        """Return the customers with model-only values, (N,)."""
+        return np.asarray(~(site.feeder.busbar_incidence() * self.measured).any(axis=1), dtype=np.bool_)
+
+
+def grounds(
+    site: Site, tick: Tick, estimate: Estimate | None = None, verdict: Verdict | None = None
+) -> ReferenceVoltages:
+    """Return the readings that the values of a tick use. Without a monitor each reading counts."""
+    used = np.array([reading is not None for reading in tick.readings], dtype=np.bool_)
+    busbar = np.isfinite(np.broadcast_to(busbar_volt(site, tick), len(busbar_phases(site))))
+    if estimate is not None:
+        used &= estimate.trusted
+    if verdict is not None:
+        busbar = busbar & (verdict.cause is not Cause.NO_BUSBAR)
+        busbar = busbar & ~verdict.busbar if verdict.busbar.size else busbar
+    of_meters = site.feeder.busbar_incidence()[site.meters[used]].any(axis=0)
+    return ReferenceVoltages(np.asarray(of_meters, dtype=np.bool_), busbar)
+
+
+def bus_volts(site: Site, v2_bus: Floats, measured: Bools) -> tuple[Floats, Floats, Bools]:
+    """Return the voltage of every bus, V: in three phases that of the phase furthest from nominal.
+
+    v2_bus (n,): squared voltages as in `gridsec.interface.Estimate`, pu.
+    measured (b,): phases with a reading, see `ReferenceVoltages`. The other phases of a bus count only where
+        it has none of these.
+    Returns one (b + 1,): voltage of each bus, V.
+    Returns phases (b + 1, 3) or (b + 1, 0): voltage of each of its phases, V, NaN for one that it does not
+        have; nothing on a balanced feeder.
+    Returns model_only (b + 1,): the first is model only.
+    """
+    v = volts(site.base_volt, v2_bus)
+    tree = site.spanning
+    if isinstance(tree, Feeder):
+        return v, np.zeros((v.size, 0)), np.full(v.size, not measured[0])
+    phases = np.where(tree.phases, v.reshape(-1, 3), np.nan)
+    there = tree.phases & measured
+    among = np.where(there.any(axis=1, keepdims=True), there, tree.phases)
+    off = np.where(among, np.nan_to_num(np.abs(phases - site.nominal_volt.reshape(-1, 3)), nan=-0.5), -1.0)
+    one = np.take_along_axis(phases, off.argmax(axis=1)[:, None], axis=1)[:, 0]
+    return one, phases, np.asarray(~there.any(axis=1), dtype=np.bool_)
+
+
+def std_volts(site: Site, estimate: Estimate) -> Floats:
+    """Return the standard deviation of every customer's voltage, V, (N,): given, or from the bound."""
+    half, share = (estimate.std, 1.0) if estimate.std.size else (estimate.bound, 1.0 / 3.0)
+    base = site.customer_volt
+    return np.asarray(0.5 * share * (volts(base, estimate.v2 + half) - volts(base, estimate.v2 - half)))
+
+
+def attack_volts(site: Site, tick: Tick, verdict: Verdict) -> Floats:
+    """Return the excess of every meter that is named as manipulated, (p,), see `excess_volts`."""
+    reported = np.array([math.nan if r is None else r.v_volt for r in tick.readings], dtype=np.float64)
+    return excess_volts(site.customer_volt[site.meters], reported, verdict.attack, verdict.suspects)
+
+
+def excess_volts(base: Floats, reported: Floats, attack: Floats, named: Bools) -> Floats:
+    """Convert attacks on squared voltages to volts: ``sqrt(y) - sqrt(y - a)``, 0 without a name.
+
+    base, reported (k,): 1 pu, and the reported voltages, V.
+    attack (k,): excess of the squared voltages, pu.
+    named (k,): True for devices named as manipulated.
+    """
+    true = volts(base, (reported / base) ** 2 - attack)
+    return np.where(named, reported - true, 0.0)
+
+
+BUSBAR = "substation"
+"""Name of the busbar meter in reports, as in its zenoh key; reserved for it."""
+
+
+ModelOnly: TypeAlias = Annotated[
+    bool,
+    Field(
+        description="The estimates use no voltage reading of this tick, only powers, the model and the state "
+        "of the estimator."
+    ),
+]
+"""See `ReferenceVoltages`."""
+ClockOffset: TypeAlias = Annotated[
+    float | None,
+    Field(description="Lead of its clock relative to the other meters, s; null if not measurable."),
+]
+
+
+@dataclass(frozen=True, slots=True)
+class BusbarMeterState:
+    """The busbar meter at the latest tick; in three phases the numbers belong to one phase."""
+
+    # Estimators that trust this meter, or do not use it, never test it.
+    judged: Annotated[
+        bool,
+        Field(
+            description="The estimator tests this meter, and this tick has the readings for the test: of "
+            "this meter and of a trusted meter in the same phase."
+        ),
+    ] = False
+    seen: Annotated[bool, Field(description="A usable reading belongs to this tick.")] = False
+    suspect: Annotated[bool, Field(description="The verdict names it as manipulated.")] = False
+    phases: Annotated[
+        tuple[str, ...], Field(description="Manipulated phases, a, b or c; empty on a balanced feeder.")
+    ] = ()
+    phase: Annotated[
+        str | None,
+        Field(description="Phase of the numbers, the one with the largest deviation; null if balanced."),
+    ] = None
+    v_volt_reported: Annotated[float | None, Field(description="Reported voltage, phase to neutral, V.")] = (
+        None
+    )
+    # The reported voltage while the meter is trusted.
+    v_volt_estimated: Annotated[
+        float | None, Field(description="Reconstructed voltage of the busbar, V.")
+    ] = None
+    attack_volt_estimated: Annotated[
+        float | None, Field(description="Mean excess of its reading, V; 0 if not suspect.")
+    ] = None
+    model_only: ModelOnly = False
+    clock_offset_s: ClockOffset = None
+    meter: Annotated[str, Field(description="Its name in alarms and explanations.")] = BUSBAR
+
+
+UNKNOWN_BUSBAR = BusbarMeterState()
+"""Default without any data."""
+
+
+def busbar_report(
+    site: Site, tick: Tick, estimate: Estimate | None = None, verdict: Verdict | None = None
+) -> BusbarMeterState:
+    """Return the report of the busbar meter."""
+    names, reported = busbar_phases(site), _reported(site, tick)
+    nothing = np.full(reported.size, math.nan)
+    judges = verdict is not None and verdict.busbar.size > 0
+    rests_on = grounds(site, tick, estimate, verdict)
+    suspect = np.zeros(reported.size, dtype=np.bool_)
+    attack, estimated = nothing, nothing
+    if verdict is not None and judges:
+        suspect, attack = verdict.busbar, _attack_volts(site, reported, verdict)
+    if estimate is not None:
+        places = site.feeder.busbar_places()
+        estimated = volts(site.base_volt[places], estimate.v2_bus[places])
+    k = _furthest(suspect, attack if suspect.any() else reported - estimated)
+
+    def number(values: Floats) -> float | None:
+        return float(values[k]) if math.isfinite(values[k]) else None
+
+    return BusbarMeterState(
+        judged=judges and bool((np.isfinite(reported) & rests_on.meters).any()),
+        seen=math.isfinite(reported[k]),
+        suspect=bool(suspect.any()),
+        phases=tuple(name for name, one in zip(names, suspect, strict=True) if one and name is not None),
+        phase=names[k],
+        v_volt_reported=number(reported),
+        v_volt_estimated=number(estimated),
+        attack_volt_estimated=number(attack),
+        model_only=not rests_on.measured[k],
+        clock_offset_s=tick.busbar_offset,
+    )
+
+
+def busbar_in_words(site: Site, which: Bools) -> str:
+    """Return the name of the busbar meter for a sentence, with the phases if there are several."""
+    names = [name for name, one in zip(busbar_phases(site), which, strict=True) if one and name is not None]
+    phases = f" (phase{'s' * (len(names) > 1)} {', '.join(names)})" if names else ""
+    return f"the substation's meter{phases}"
+
+
+def busbar_off(site: Site, tick: Tick, verdict: Verdict) -> str:
+    """Return the deviation of a busbar meter named as manipulated, in the phase with the largest one."""
+    reported = _reported(site, tick)
+    attack = _attack_volts(site, reported, verdict)
+    k = _furthest(verdict.busbar, attack)
+    if not math.isfinite(attack[k]):
+        return "has no reading at present"
+    percent = 100.0 * attack[k] / max(reported[k] - attack[k], 1e-6 * reported[k])
+    much = f"{abs(attack[k]):.1f} V ({abs(percent):.1f} %) {'more' if attack[k] > 0 else 'less'}"
+    return f"reads {much} than the meters of the feeder imply"
+
+
+def _furthest(which: Bools, off: Floats) -> int:
+    """Phase with the largest deviation among the given ones, or among all if none is given."""
+    among = which if which.any() else np.ones_like(which)
+    return int(np.where(among, np.nan_to_num(np.abs(off), nan=-0.5), -1.0).argmax())
+
+
+def _reported(site: Site, tick: Tick) -> Floats:
+    """Voltages reported by the busbar meter, V, NaN without a reading, (b,)."""
+    return np.broadcast_to(busbar_volt(site, tick), len(busbar_phases(site)))
+
+
+def _attack_volts(site: Site, reported: Floats, verdict: Verdict) -> Floats:
+    """Excess of the busbar meter in phases named as manipulated, V, (b,)."""
+    base = site.base_volt[site.feeder.busbar_places()]
+    return excess_volts(base, reported, verdict.busbar_attack, verdict.busbar)
+
+
+# --- Reasons and data errors ---
+
+
+_log = structlog.get_logger("gridsec.data_errors")
+
+
+@dataclass(frozen=True, slots=True)
+class DataErrorReport:
+    """An error of the feeder's files that explains accused meters as well as a manipulation does."""
+
+    kind: DataErrorKind
+    meters: Annotated[tuple[str, ...], Field(description="The accused meters that the error explains.")]
+    customers: Annotated[
+        tuple[str, ...], Field(description="The one customer, or the two that are exchanged.")
+    ]
+    proposed: Annotated[
+        tuple[str, ...],
+        Field(description="Bus and phase of each customer that agree with the readings."),
+    ]
+    study: Annotated[str, Field(description="Command that checks the error on a recording.")]
+    text: Annotated[str, Field(description="One sentence for the operator.")]
+
+
+class DataErrors:
+    """Search for errors of a feeder's files; it runs only while a meter is accused."""
+
+    def __init__(self, site: Site) -> None:
+        self._site = site
+        self._window = data_errors.begin()
+        self._design: data_errors.DataErrorDesign | None = None
+        self._designed = False
+
+    def renew(self) -> None:
+        """Restart the window."""
+        self._window = data_errors.begin()
+
+    def follow(self, frame: Frame, estimate: Estimate, verdict: Verdict) -> DataErrorReport | None:
+        """Add one tick to the window; return the error that explains a meter accused at this tick."""
+        accused = data_errors.accused(verdict)
+        if not self._designed:
+            if not accused.any():
+                return None
+            self._design, self._designed = self._prepared(), True
+        if self._design is None:
+            return None
+        try:
+            self._window = data_errors.follow(self._design, self._window, frame, estimate.x, accused)
+        except Exception:  # noqa: BLE001 - a failed search costs no verdict
+            _log.exception(
+                "errors of the feeder's files are no longer compared", feeder=self._site.feeder.name
+            )
+            self._design = None
+            return None
+        error = self._window.error
+        if error is None or not accused[list(error.meters)].any():
+            return None
+        return _in_words(self._site, error)
+
+    def _prepared(self) -> data_errors.DataErrorDesign | None:
+        return data_errors.design(
+            plant(self._site), self._site.base_volt, self._site.tables.meta.monitor.tick_s
+        )
+
+
+_PHASE, _SWAP, _BUS = "phase", "swap", "bus"
+
+_LOOK_FOR: Final = {
+    DataErrorKind.PHASE: (_PHASE,),
+    DataErrorKind.EXCHANGED_PHASES: (_PHASE, _SWAP),
+    DataErrorKind.EXCHANGED_METERS: (_SWAP,),
+    DataErrorKind.BUS: (_BUS,),
+}
+"""Errors that `gridsec study calibrate` compares: on short lines an exchange of phases is one of meters."""
+
+
+def _in_words(site: Site, error: DataError) -> DataErrorReport:
+    customers = tuple(site.feeder.customers[i] for i in error.customers)
+    proposed = tuple(_place(site, q) for q in error.places)
+    one = customers[0]
+    match error.kind:
+        case DataErrorKind.PHASE:
+            what = f"customer {one} on another phase ({proposed[0]})"
+        case DataErrorKind.BUS:
+            what = f"customer {one} at another bus ({proposed[0]})"
+        case DataErrorKind.EXCHANGED_PHASES:
+            what = f"exchanged phases of customers {one} and {customers[1]}"
+        case DataErrorKind.EXCHANGED_METERS:
+            what = f"exchanged meters of customers {one} and {customers[1]}"
+    options = " ".join(f"--look-for {name}" for name in _LOOK_FOR[error.kind])
+    study = f"gridsec study calibrate {site.feeder.name} --readings FILE {options}"
+    return DataErrorReport(
+        kind=error.kind,
+        meters=tuple(site.meter_ids[j] for j in error.meters),
+        customers=customers,
+        proposed=proposed,
+        study=study,
+        text=f"An error of the feeder's files explains this as well: {what}. Check with `{study}`.",
+    )
+
+
+def _place(site: Site, place: int) -> str:
+    """Bus and phase of a place."""
+    if site.feeder.busbar_phases == 1:
+        return f"bus {site.feeder.buses[place]}"
+    bus, phase = divmod(place, len(PHASES))
+    return f"bus {site.spanning.buses[bus]}, phase {PHASES[phase]}"
+
+
+_NAMING: Final = frozenset({Cause.AMBIGUOUS, Cause.SILENT_METERS, Cause.CLOCK_OFFSET, Cause.MISSING_POWERS})
+"""Causes with a sentence of the monitor that contains customers in place of meters."""
+_SHOWN: Final = 5
+"""Largest number of names in a list."""
+
+
+def reason_of(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> str:
+    """Return the reason of a verdict, with the meters' ids as in alarms: the monitor uses customers only."""
+    suspects = np.flatnonzero(verdict.suspects).tolist()
+    unseen = [k for k, reading in enumerate(tick.readings) if reading is None]
+    named = _listed(site, suspects)
+    if verdict.cause is Cause.RESIDUALS:
+        sure = _named(site, tick, verdict)
+        return f"{sure} {_ways(site, verdict)}" if verdict.explanations else sure
+    if verdict.cause is Cause.AMBIGUOUS and verdict.explanations:
+        return _ways(site, verdict)
+    if verdict.cause is Cause.TOO_MANY_SUSPECTS and suspects:
+        return (
+            f"{len(suspects)} meters disagree with the feeder ({named}), and at most {max_attacked} can be "
+            "told apart. A wrong busbar reading, switch or line in the model looks the same."
+        )
+    if verdict.cause is Cause.SILENT_METERS and unseen:
+        return f"No reading from {_listed(site, unseen)}."
+    text = re.sub(r"([Tt])he meter of the busbar\b", r"\1he substation's meter", verdict.reason)
+    return _in_ids(site, text) if verdict.cause in _NAMING else text
+
+
+def _named(site: Site, tick: Tick, verdict: Verdict) -> str:
+    """Devices named as manipulated, with the deviation of a busbar meter: all estimates depend on it."""
+    accused = _who(site, verdict.suspects, verdict.inverters, busbar=verdict.busbar)
+    if not verdict.busbar.any():
+        return f"Manipulated: {accused}; further off than meter accuracy and load uncertainty allow."
+    off = busbar_off(site, tick, verdict)
+    if not verdict.suspects.any() and not verdict.inverters.any():
+        return f"Manipulated: {accused}; it {off}."
+    far = "further off than meter accuracy and load uncertainty allow"
+    return f"Manipulated: {accused}; {far}. The substation's meter {off}."
+
+
+def _ways(site: Site, verdict: Verdict) -> str:
+    """Explanations, each with its share."""
+    ways = [
+        f"{_who(site, e.meters, e.inverters, e.powers, busbar=e.busbar)} ({e.probability:.0%})"
+        for e in verdict.explanations
+    ]
+    more = f" or {len(ways) - _SHOWN} more" if len(ways) > _SHOWN else ""
+    begin = "Several explanations fit" if len(ways) > 1 else "Only this explains the readings"
+    return f"{begin}: {' or else '.join(ways[:_SHOWN])}{more}."
+
+
+def _listed(site: Site, which: Sequence[int]) -> str:
+    """Ids of meters, at most `_SHOWN`."""
+    rest = f" and {len(which) - _SHOWN} more" if len(which) > _SHOWN else ""
+    return ", ".join(site.meter_ids[k] for k in which[:_SHOWN]) + rest
+
+
+def _who(site: Site, meters: Bools, inverters: Bools, powers: Bools | None = None, *, busbar: Bools) -> str:
+    """Meters by their ids, other devices by their customers, as in alarms; at most `_SHOWN` of a kind."""
+    found = np.flatnonzero(meters).tolist()
+    parts = [_listed(site, found)] if found else []
+    doubted = () if powers is None else np.flatnonzero(powers)
+    for what, customers in (("inverter", site.droop.customer[inverters]), ("reported power", doubted)):
+        names = [site.feeder.customers[int(c)] for c in customers]
+        rest = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        if names:
+            parts.append(f"the {what}{'s' if len(names) > 1 else ''} of {', '.join(names[:_SHOWN])}{rest}")
+    if busbar.any():
+        parts.append(busbar_in_words(site, busbar))
+    return " and ".join(parts) or "no device"
+
+
+def _in_ids(site: Site, text: str) -> str:
+    """Replace customers in a sentence by their meters' ids.
+
+    Longer names come first, since one name may be the beginning of another. Inverters keep their customer's
+    name, as in alarms.
+    """
+    meter_of = {
+        site.feeder.customers[int(customer)]: meter
+        for customer, meter in zip(site.meters, site.meter_ids, strict=True)
+    }
+    names = "|".join(re.escape(name) for name in sorted(meter_of, key=len, reverse=True))
+    return re.sub(rf"(?<!\w)(?<!nverter of )(?:{names})(?!\w)", lambda found: meter_of[found[0]], text)
+
+
+# --- Report ---
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ same key again stores it, or finds it stored. After `WriterLost` a store writes 
 
 from service.store.history import HistoryRules
 from service.store.schema import AlarmEvent, OutcomeUnknown, Rejected, StoreUnavailable, WriterLost
-from service.store.writes import BAD_READINGS_KEPT, Store
+from service.store.store import BAD_READINGS_KEPT, Store
 
 __all__ = [
     "BAD_READINGS_KEPT",

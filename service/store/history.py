@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from service.report.report import FeederReport, MeterState, finite
-from service.report.voltages import BUSBAR
+from service.report.report import BUSBAR, FeederReport, MeterState, finite
 
 _COLUMNS = ("v_volt_reported", "v_volt_estimated", "score", "threshold")
 _SEEN, _SUSPECT, _MODEL_ONLY = 1, 2, 4

@@ -22,7 +22,7 @@ from feeders.model.site import Site
 from gridsec.arrays import Floats
 from gridsec.errors import GridsecError
 from gridsec.estimators.sequential import SuspicionRecord
-from service.report.voltages import Phase, busbar_phases
+from service.report.report import Phase, busbar_phases
 
 FORMAT: Final = 1
 """Version of the text; it increases with a change of its fields."""

@@ -51,11 +51,11 @@ from service.ingest.align import AlignRules
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import MeterClient
 from service.settings import refuse_exposed, settings
-from service.store import Store, backup, committer, schema, writes
+from service.store import Store, backup, committer, schema
 from service.store.access import AccessStore
+from service.store.committer import Batch
 from service.store.connect import NoAnswer, WriterSession
 from service.store.state_codec import decode, decode_distrust, encode, encode_distrust, fingerprint
-from service.store.write_queue import Batch
 from tests.service.stored import T0, an_alarm, raised
 
 PACKAGE = Path(service.__file__).parent
@@ -195,7 +195,7 @@ def with_store(call: Callable[[Store, Path, Patch], Any]) -> Call:
 
 
 def write_under_way(store: Store, _: Path, patch: Patch) -> None:
-    patch.setattr(writes, "ALONE_S", 0.01)
+    patch.setattr(store, "ALONE_S", 0.01)
     free = store._lock
     store._lock = cast(Any, threading.Lock())
     try:

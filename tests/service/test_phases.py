@@ -19,10 +19,9 @@ from service.cli.simulate import Pace, payload_of, play
 from service.engine.feeder_monitor import known_of
 from service.engine.replay import ReplayCounts, replay
 from service.ingest.align import Tick
-from service.ingest.decode import DecodedPayload, Wire
-from service.ingest.reading import BadReason, Reading
+from service.ingest.reading import BadReason, DecodedPayload, Reading, Wire
 from service.report.feeder_info import detail
-from service.report.voltages import snapshot
+from service.report.report import snapshot
 from tests.service.running import service, until
 
 EUROPEAN = "ieee-european-lv"

@@ -23,8 +23,7 @@ from service.alarms.state_machine import (
 )
 from service.alarms.state_machine import from_json as alarm_from_json
 from service.alarms.state_machine import to_json as alarm_json
-from service.report.report import LearningReport, StalledMeter, with_learning
-from service.report.voltages import BUSBAR
+from service.report.report import BUSBAR, LearningReport, StalledMeter, with_learning
 from tests.service.reports import FEEDER, inverter, meter, report, with_inverters
 
 UNDECIDED_CAUSES = [cause for cause in Cause if cause not in (Cause.AGREEMENT, Cause.RESIDUALS)]

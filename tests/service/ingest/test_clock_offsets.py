@@ -15,8 +15,7 @@ from service.alarms.state_machine import AlarmBook
 from service.engine.feeder_monitor import FeederMonitor, align_rules, design
 from service.ingest.align import FEWEST, KEPT, OFFSETS_TICKS, Aligner, Clock, ClockOffsets, Tick, rules
 from service.ingest.reading import Reading
-from service.report.report import to_json
-from service.report.voltages import snapshot
+from service.report.report import snapshot, to_json
 from tests.service.played import ingest
 from tests.service.reports import meter, report
 

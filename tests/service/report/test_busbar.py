@@ -27,8 +27,7 @@ from service.cli.simulate import key_of, payload_of
 from service.engine.feeder_monitor import FeederMonitor, align_rules, design
 from service.ingest.align import Clock, Tick
 from service.ingest.reading import Reading
-from service.report.report import FeederReport, blind, build, to_json
-from service.report.voltages import BUSBAR, BusbarMeterState, busbar_report
+from service.report.report import BUSBAR, BusbarMeterState, FeederReport, blind, build, busbar_report, to_json
 from service.store.history import pack, rows, unpack
 from service.store.state_codec import KeptInvalid, decode_distrust, encode_distrust
 from tests.codes import refused

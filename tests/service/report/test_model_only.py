@@ -21,8 +21,7 @@ from service.api.models import HistoryPoint
 from service.engine.feeder_monitor import design
 from service.ingest.align import Tick
 from service.ingest.reading import Reading
-from service.report.report import FeederReport, blind, build, to_json
-from service.report.voltages import BUSBAR, snapshot
+from service.report.report import BUSBAR, FeederReport, blind, build, snapshot, to_json
 from service.store import Store
 from tests.service.engine.test_silence import QUIET_VOLT, START, Street
 from tests.service.running import FEEDER, service, until

@@ -21,8 +21,16 @@ from service.alarms.conditions import AlarmKind, conditions
 from service.engine.feeder_monitor import design
 from service.ingest.align import Tick
 from service.ingest.reading import Reading
-from service.report.report import ExplanationReport, FeederReport, Silence, blind, build, to_json
-from service.report.voltages import BUSBAR, snapshot
+from service.report.report import (
+    BUSBAR,
+    ExplanationReport,
+    FeederReport,
+    Silence,
+    blind,
+    build,
+    snapshot,
+    to_json,
+)
 
 T = 1_795_212_000.0
 

@@ -239,7 +239,7 @@ SHORT = HistoryRules(step_s=0.0, keep_s=100.0)
 def test_a_clock_that_leaps_costs_no_history_unless_it_goes_on(
     url: str, leap_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.store.writes._PRUNE_EVERY", 100)
+    monkeypatch.setattr("service.store.store._PRUNE_EVERY", 100)
     with Store(url, history=SHORT) as store:
         store.commit(reports=every(0.5, 0.0, 50.0))
         leap = 50.0 + leap_s

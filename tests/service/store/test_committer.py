@@ -20,8 +20,8 @@ from service.alarms.state_machine import (
     Severity,
 )
 from service.report.report import FeederReport
-from service.store import Rejected, write_queue
-from service.store.write_queue import WriteQueue
+from service.store import Rejected, committer
+from service.store.committer import WriteQueue
 
 KIND, LEVEL = AlarmKind.METER_MANIPULATED, Severity.CRITICAL
 RAISED = Alarm("", KIND, "f", "m", LEVEL, AlarmState.RAISED, 1, 0, 0, None, "", AlarmEvidence(),
@@ -43,8 +43,8 @@ def report(t: float) -> FeederReport:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(write_queue, "TRANSITIONS_KEPT", 20)
-    monkeypatch.setattr(write_queue, "RECORDS_KEPT", 5)
+    monkeypatch.setattr(committer, "TRANSITIONS_KEPT", 20)
+    monkeypatch.setattr(committer, "RECORDS_KEPT", 5)
 
 
 @pytest.mark.usefixtures("small")
@@ -110,7 +110,7 @@ Steps = st.lists(
 def test_the_database_ends_with_the_state_of_every_alarm_that_stands(steps: list[str]) -> None:
     """Alarms flip at random while the database comes and goes; a dictionary is the oracle."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(write_queue, "TRANSITIONS_KEPT", 8)
+        patch.setattr(committer, "TRANSITIONS_KEPT", 8)
         book = WriteQueue(lambda *_: None)
         truth: dict[str, Alarm] = {}
         database: dict[str, Alarm] = {}

@@ -15,8 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyarrow import ipc
 
-from service.ingest.decode import DETAILED_PER_REASON, DecodedPayload, Wire
-from service.ingest.reading import BadReason, Known, Reading
+from service.ingest.reading import DETAILED_PER_REASON, BadReason, DecodedPayload, Known, Reading, Wire
 
 T = 1_795_212_000.25
 KNOWN = {"village": Known(frozenset({"a", "b", "c"}), 230.94, 10_000.0)}
