@@ -195,7 +195,7 @@ def with_store(call: Callable[[Store, Path, Patch], Any]) -> Call:
 
 
 def write_under_way(store: Store, _: Path, patch: Patch) -> None:
-    patch.setattr(store, "ALONE_S", 0.01)
+    patch.setattr("service.store.store.ALONE_S", 0.01)
     free = store._lock
     store._lock = cast(Any, threading.Lock())
     try:
