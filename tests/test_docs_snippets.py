@@ -54,7 +54,8 @@ def blocks(page: str) -> list[tuple[str, str, str | None]]:
     return [(re.findall(r"^##+ (.*)$", text[:at], re.MULTILINE)[-1], code, out) for at, code, out in found]
 
 
-EVERY = [pytest.param(code, out, id=head) for head, code, out in blocks("your-own-system.md")]
+PAGES = ("your-own-system.md", "theory-distributed.md")
+EVERY = [pytest.param(code, out, id=head) for page in PAGES for head, code, out in blocks(page)]
 MODULE, WATCH = blocks("your-own-estimator.md")
 
 
@@ -69,7 +70,7 @@ def test_a_block_prints_what_stands_below_it(code: str, printed: str | None) -> 
 
 def test_every_method_takes_ten_lines_besides_the_imports() -> None:
     long = {}
-    for head, code, _ in blocks("your-own-system.md"):
+    for head, code, _ in (block for page in PAGES for block in blocks(page)):
         imports = sum(isinstance(one, (ast.Import, ast.ImportFrom)) for one in ast.parse(code).body)
         count = sum(bool(line.strip()) for line in code.splitlines()) - imports
         if count > LINES or max(map(len, code.splitlines())) > WIDTH:

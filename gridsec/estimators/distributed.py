@@ -64,8 +64,8 @@ OPEN: Final = np.array([UNMETERED, UNKNOWN_POWER, UNKNOWN_POWER])
 """`Message.doubt` of a boundary without messages."""
 PATIENCE: Final = 3
 """Rounds until a lost message, a dispute, or for each area a claimed residual, takes effect."""
-_PART: Final = 3
-"""At most a part of 1 / 3 of an area's meters is manipulated, or its concentrator, or a neighbour's."""
+SAVED: Final = 3
+"""Meters that one manipulated concentrator outweighs: priors 1 / 10 and 1 / 1000 are as likely."""
 BOUNDARY: Final = 3
 """Boundary variables beside the common errors: u, P, Q."""
 _MODEL: Final = 5
@@ -467,6 +467,7 @@ class Concentrator:
         self._age = dict.fromkeys(area.neighbours, PATIENCE)
         self._beyond = dict.fromkeys(area.neighbours, 0)
         self._claims = dict.fromkeys(area.neighbours, (0.0, 0))
+        self._tried = self.trusted
         self._y = np.full(area.meters.size, np.nan)
         self._power = np.zeros((2, area.customers.size))
         self._v0 = 1.0
@@ -493,7 +494,9 @@ class Concentrator:
 
     def send(self) -> dict[int, Message]:
         """Messages to all neighbours."""
-        out = {j: self._message(j) for j in self.area.neighbours}
+        loo, std = self._leave_one_out(self.trusted, self._closed())
+        own = float(np.max(np.abs(loo / std), where=self.trusted & self._available(), initial=0.0))
+        out = {j: self._message(j, own) for j in self.area.neighbours}
         for j in self._age:
             self._age[j] += 1
         return out
@@ -503,14 +506,20 @@ class Concentrator:
 
         The largest normalised residual of the feeder is removed first, as by a central estimator: a meter is
         distrusted while no neighbour claims a larger one. A claim that stands for `PATIENCE` rounds per area
-        expires. Beyond a third of its meters, an area disputes a neighbour instead, if that leaves fewer.
+        expires. A neighbour is disputed instead where that exonerates `SAVED` meters or more.
         """
         limit, shut = _limit(1), self._closed()
-        self.trusted = self._moved(self.trusted, shut, max(limit, self._claimed()), limit)
-        if not self._admissible(self.trusted):
+        before, suspects = self.trusted, int(np.count_nonzero(~self.trusted))
+        self.trusted = self._moved(before, shut, max(limit, self._claimed()), limit)
+        if (
+            suspects >= SAVED
+            and np.array_equal(before, self.trusted)
+            and not np.array_equal(before, self._tried)
+        ):
+            self._tried = before
             trials = {j: self._descent(shut - {j}, limit) for j in sorted(shut)}
-            blamed = min(trials, key=lambda j: int((~trials[j]).sum()), default=-1)
-            if blamed in trials and self._admissible(trials[blamed]):
+            blamed = min(trials, key=lambda j: int(np.count_nonzero(~trials[j])), default=-1)
+            if blamed in trials and suspects - np.count_nonzero(~trials[blamed]) >= SAVED:
                 self.trusted, self.disputed = trials[blamed], self.disputed | {blamed}
                 self._beyond[blamed] = 0
         self._test_messages(limit)
@@ -535,11 +544,6 @@ class Concentrator:
             if np.array_equal(now, before):
                 break
         return now
-
-    def _admissible(self, trusted: Bools) -> bool:
-        """True while at most a third of the meters with a reading are distrusted."""
-        available = self._available()
-        return bool(_PART * np.count_nonzero(available & ~trusted) <= np.count_nonzero(available))
 
     def estimate(self) -> AreaEstimate:
         """Estimate with the present readings, messages and trust."""
@@ -715,7 +719,7 @@ class Concentrator:
         std[out] = np.sqrt(np.maximum(variance, 0.0) + self.noise[out])
         return loo, std
 
-    def _message(self, j: int) -> Message:
+    def _message(self, j: int, worst: float) -> Message:
         """Likelihood of everything on this side of the boundary to a neighbour."""
         area, shut = self.area, self._closed()
         latents = self._latents(shut, to=j)
@@ -731,9 +735,7 @@ class Concentrator:
         information = gain.T @ both[:, :-1] / np.multiply.outer(scale, scale)
         up, bus = j == area.above, self._bus(j)
         down = np.array([self._swept.linear[bus], self._swept.v2[bus], 0.0, 0.0, 0.0])
-        others = (self._inbox[i].worst for i in shut - {j})
-        loo, std = self._leave_one_out(self.trusted, shut)
-        own = np.abs(loo / std)[self.trusted & self._available()]
+        others = [0.0, *(self._inbox[i].worst for i in shut - {j})]
         return Message(
             information=0.5 * (information + information.T),
             vector=gain.T @ both[:, -1] / scale,
@@ -742,7 +744,7 @@ class Concentrator:
             reference=self._reference(j),
             model=self._swept.into if up else down,
             doubt=np.where(np.arange(BOUNDARY) > 0, added, 0.0) if up else added * [1.0, 0.0, 0.0],
-            worst=float(max([*own.tolist(), *others], default=0.0)),
+            worst=max(worst, *others),
         )
 
 

@@ -1,9 +1,9 @@
 """Boundary messages of distributed estimation over zenoh.
 
 A concentrator publishes on ``<prefix>/<feeder>/<sender>/<receiver>`` and subscribes to
-``<prefix>/<feeder>/*/<own number>``; payloads are `gridsec.estimators.distributed.Message.to_json`. The prefix is
-not that of the service. With one access rule per certificate (docs/access.md) a concentrator writes only the
-keys with its own number as sender.
+``<prefix>/<feeder>/*/<own number>``. Payloads are `gridsec.estimators.distributed.Message.to_json`. The
+prefix is not that of the service. With one access rule per certificate (docs/access.md) a concentrator writes
+only the keys with its own number as sender.
 """
 
 from __future__ import annotations
