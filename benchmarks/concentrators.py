@@ -44,7 +44,7 @@ from gridsec.estimators.sequential.load_uncertainty import prior
 from gridsec.grid.radial import Feeder
 from gridsec.interface import Frame
 
-ROUNDS = 60
+ROUNDS = 120
 """Rounds of the concentrators per tick that is judged: more than the longest search needs."""
 SIZE_PU = 0.06
 """Manipulation of a squared voltage, pu: 6.9 V."""
