@@ -19,7 +19,6 @@ as few manipulated meters as possible.
 """
 
 from gridsec.estimators.sequential.design import SequentialDesign, SequentialOptions, design
-from gridsec.estimators.sequential.load_uncertainty import LoadDoubt
 from gridsec.estimators.sequential.meter_bias import (
     Commission,
     Learning,
@@ -30,9 +29,16 @@ from gridsec.estimators.sequential.meter_bias import (
     progress,
     to_arrays,
 )
-from gridsec.estimators.sequential.state import SequentialState, init, renew
+from gridsec.estimators.sequential.posterior import LoadDoubt
+from gridsec.estimators.sequential.state import (
+    SequentialState,
+    SuspicionRecord,
+    distrusted,
+    init,
+    renew,
+    warm_start,
+)
 from gridsec.estimators.sequential.step import step
-from gridsec.estimators.sequential.suspicion_record import SuspicionRecord, distrusted, warm_start
 
 __all__ = [
     "Commission",

@@ -13,7 +13,6 @@ from gridsec.arrays import Bools, Floats
 from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, hypotheses
-from gridsec.estimators.sequential.fault_dictionary import false_power_charge
 from gridsec.estimators.sequential.hypotheses import HypothesisSearch, _components
 from gridsec.estimators.sequential.posterior import (
     LeaveOneOut,
@@ -22,7 +21,14 @@ from gridsec.estimators.sequential.posterior import (
     condition,
     leave_one_out,
 )
-from gridsec.estimators.sequential.search import Candidate, Candidates, Hypothesis, descend, set_cost
+from gridsec.estimators.sequential.search import (
+    Candidate,
+    Candidates,
+    Hypothesis,
+    descend,
+    false_power_charge,
+    set_cost,
+)
 from gridsec.estimators.sequential.time_scales import Scales, ScaleTest, push, scale_test, update_posterior
 from gridsec.grid.droop import fleet
 from gridsec.grid.meter import MeterAccuracy
@@ -271,7 +277,7 @@ def test_what_is_judged_is_what_each_search_begins_with(
             np.testing.assert_allclose(loo.residual, leave_one_out(start, m).residual)
         return plain(start, m, *rest, loo=loo, **more)
 
-    monkeypatch.setattr(hypotheses.search, "descend", checked)
+    monkeypatch.setattr(hypotheses, "descend", checked)
     found, _ = made(now, view)
     np.testing.assert_array_equal(~found.best.trusted, suspects)
     assert any(told) is not suspected

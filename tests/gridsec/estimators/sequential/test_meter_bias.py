@@ -14,8 +14,7 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid
 from gridsec.estimators import sequential
 from gridsec.estimators.sequential import Commission, SequentialDesign, SequentialOptions
-from gridsec.estimators.sequential.frame_uncertainty import nominal as no_doubts
-from gridsec.estimators.sequential.load_uncertainty import LoadDoubt
+from gridsec.estimators.sequential.measurements import nominal_uncertainty as no_doubts
 from gridsec.estimators.sequential.meter_bias import (
     Learned,
     Learning,
@@ -30,7 +29,7 @@ from gridsec.estimators.sequential.meter_bias import (
     renew,
     to_arrays,
 )
-from gridsec.estimators.sequential.posterior import condition, leave_one_out
+from gridsec.estimators.sequential.posterior import LoadDoubt, condition, leave_one_out
 from gridsec.estimators.sequential.time_scales import Scales, empty, scale_test
 from gridsec.interface import Frame
 from tests.codes import refused

@@ -10,7 +10,7 @@ import pytest
 
 from gridsec.estimators import sequential
 from gridsec.estimators.sequential import SequentialDesign
-from gridsec.estimators.sequential.busbar_meter import (
+from gridsec.estimators.sequential.device_checks import (
     BusbarTest,
     BusbarTrust,
     HonestErrors,
@@ -19,10 +19,9 @@ from gridsec.estimators.sequential.busbar_meter import (
     track_busbar,
     trusted_busbar,
 )
-from gridsec.estimators.sequential.error_bounds import PowerErrors
-from gridsec.estimators.sequential.load_uncertainty import prior
+from gridsec.estimators.sequential.measurements import PowerErrors
 from gridsec.estimators.sequential.output import explanations_sentence
-from gridsec.estimators.sequential.posterior import condition, leave_one_out
+from gridsec.estimators.sequential.posterior import condition, leave_one_out, voltage_prior
 from gridsec.grid.meter import busbar_error
 from gridsec.interface import Cause, Decision, Explanation, Frame
 from tests.gridsec.estimators.sequential.test_monitor import Answers, prepare, watch
@@ -68,7 +67,7 @@ class TestOneMore:
     def sigmas(self, m: np.ndarray) -> float:
         """By generalised least squares: what the meters say of the busbar, and what it says itself."""
         design = self.design
-        alone = prior(
+        alone = voltage_prior(
             design.plant.feeder,
             design.prior.meters,
             design.doubt,

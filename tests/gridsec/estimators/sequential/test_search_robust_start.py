@@ -13,8 +13,15 @@ from benchmarks.sequential_step import Watched
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.sequential import hypotheses, identify
 from gridsec.estimators.sequential import search as module
-from gridsec.estimators.sequential.load_uncertainty import LoadDoubt, prior
-from gridsec.estimators.sequential.posterior import Posterior, Prior, add_unknown, condition, remove_meter
+from gridsec.estimators.sequential.posterior import (
+    LoadDoubt,
+    Posterior,
+    Prior,
+    add_unknown,
+    condition,
+    remove_meter,
+    voltage_prior,
+)
 from gridsec.estimators.sequential.search import Limits, covers, robust_set
 from gridsec.estimators.sequential.time_scales import ScaleData
 from tests.gridsec.street import random_tree
@@ -26,7 +33,7 @@ def street(rng: np.random.Generator, customers: int) -> Prior:
     """What errors of 0.6 kW do to the voltages of a random tree."""
     tree = random_tree(customers, rng, drop=0.04)
     doubt = LoadDoubt(np.full(customers, 0.006), np.full(customers, 0.002), 600.0)
-    return prior(tree, np.arange(1, customers + 1), doubt, busbar=4e-4)
+    return voltage_prior(tree, np.arange(1, customers + 1), doubt, busbar=4e-4)
 
 
 def readings(rng: np.random.Generator, p: Prior, noise: Floats, lie: float) -> tuple[Floats, Bools]:
