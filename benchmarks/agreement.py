@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, load, to_frame
-from feeders.registry.registry import DIRECT, SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.registry import DIRECT, SEQUENTIAL, DesignedEstimator, choose, design
 from feeders.simulation.attacks import NoSuchAttack
 from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
 from gridsec.interface import Verdict

@@ -25,7 +25,7 @@ import numpy as np
 from benchmarks._arguments import count, positive
 from feeders.model.site import Site, load
 from feeders.simulation.demand import Variation
-from feeders.simulation.meters import Channel, MeterErrors, SimulatedMeters
+from feeders.simulation.plant import Channel, MeterErrors, SimulatedMeters
 from feeders.simulation.recording import record
 from feeders.simulation.scenario import Scenario
 from feeders.studies.calibrate.study import calibrate

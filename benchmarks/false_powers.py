@@ -26,7 +26,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, load, to_frame
-from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.registry import SEQUENTIAL, DesignedEstimator, choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec, NoSuchAttack, manipulations
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 

@@ -15,9 +15,9 @@ from time import process_time
 import numpy as np
 
 from feeders.model.site import Site, load, to_frame
-from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.registry import SEQUENTIAL, DesignedEstimator, choose, design
 from feeders.simulation.attacks import NoSuchAttack
-from feeders.simulation.meters import MeterErrors
+from feeders.simulation.plant import MeterErrors
 from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
 from gridsec.attack import Attack, Replay
 from gridsec.estimators.sequential import attack_kind

@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import load
-from feeders.registry.registry import design
+from feeders.registry import design
 from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.scenario import START
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, frames

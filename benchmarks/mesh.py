@@ -17,9 +17,9 @@ import numpy as np
 
 from feeders.format.tables import FeederTables, LineRow
 from feeders.model.site import Site, from_tables, load
-from feeders.registry.registry import design
+from feeders.registry import design
 from feeders.simulation.attacks import AttackKind, AttackSpec
-from feeders.simulation.powerflow_three_phase import power_flow
+from feeders.simulation.powerflow import power_flow
 from feeders.simulation.trial import LoadError, Trial, judge
 from gridsec.arrays import Floats
 from gridsec.grid.meshed import Meshed

@@ -19,8 +19,8 @@ from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.errors import NotObservable
 from gridsec.estimators import exact_bank, partial
 from gridsec.estimators import partial as partial_observers
-from gridsec.estimators.inputs import PreviousStep, clean
 from gridsec.estimators.partial import CodeWord, Parts
+from gridsec.estimators.plant import PreviousStep, clean
 from gridsec.interface import Frame
 from gridsec.secure.decode import cospark
 from gridsec.secure.decode.noise import correction_constants

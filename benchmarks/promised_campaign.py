@@ -28,7 +28,7 @@ from feeders.studies.campaign.guarantees import promised
 from feeders.studies.campaign.plan import CampaignPlan, Place
 from feeders.studies.campaign.study import campaign
 from feeders.studies.detectable import detectable
-from feeders.studies.workers import Here, Processes
+from feeders.studies.running import Here, Processes
 
 FEEDER, LIES, LIARS = "simbench-lv-rural1", 10_000, 2
 PLAN = CampaignPlan(

@@ -22,7 +22,7 @@ from itertools import product
 import numpy as np
 
 from feeders.model.site import load
-from feeders.registry.registry import DesignedEstimator, choose, design
+from feeders.registry import DesignedEstimator, choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, TrialResult, frames, judge
 from gridsec.estimators.sequential import SequentialDesign

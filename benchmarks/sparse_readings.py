@@ -33,8 +33,8 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, from_tables, load
-from feeders.registry.registry import design
-from feeders.simulation.meters import Channel, MeterOutage
+from feeders.registry import design
+from feeders.simulation.plant import Channel, MeterOutage
 from feeders.simulation.scenario import START
 from feeders.simulation.trial import FrameTruth, Trial, frames
 from gridsec.arrays import Bools

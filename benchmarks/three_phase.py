@@ -25,7 +25,7 @@ import numpy as np
 
 from feeders.model.site import from_tables
 from feeders.model.three_phase import ThreePhaseSite, load_three_phase
-from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow, sequence_ohm
+from feeders.simulation.powerflow import UnbalancedPowerFlow, sequence_ohm
 from gridsec.arrays import Floats, Phasors, spectral_radius
 from gridsec.errors import DesignInfeasible
 from gridsec.grid.droop import fleet

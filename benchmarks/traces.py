@@ -37,7 +37,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Snapshot, load, to_frame
-from feeders.registry.registry import design
+from feeders.registry import design
 from feeders.simulation.scenario import Scenario, random_attacks, simulate
 from service.app import Running, serve
 from service.cli.main import main as gridsec

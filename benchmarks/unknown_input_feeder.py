@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from feeders.model.site import Site, load, to_frame
-from feeders.registry.registry import DesignedEstimator, choose, design
-from feeders.simulation.meters import MeterErrors
+from feeders.registry import DesignedEstimator, choose, design
+from feeders.simulation.plant import MeterErrors
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.attack import Bias, InverterAttack
 from gridsec.interface import Decision, Verdict

@@ -12,10 +12,9 @@ from typing import Final, Self
 
 import numpy as np
 
-from feeders.format.topology import Edge, tree
+from feeders.format.validation import Edge, tree
 from feeders.model.forecast import always
-from feeders.model.load_uncertainty import unread
-from feeders.model.site import Site, Snapshot, to_frame
+from feeders.model.site import Site, Snapshot, to_frame, unread
 from feeders.model.three_phase import ThreePhaseSite
 from feeders.studies.unobservable import CurvePositions, customer_indices
 from gridsec.arrays import Floats

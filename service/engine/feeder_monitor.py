@@ -15,8 +15,8 @@ from enum import StrEnum
 from functools import cached_property
 from typing import Any
 
+from feeders import registry
 from feeders.model.site import PowerAges, Site, to_frame
-from feeders.registry import registry
 from gridsec.interface import Cause
 from service.alarms.conditions import conditions
 from service.alarms.state_machine import AlarmBook, AlarmRules, AlarmTransition, advance, hold

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from feeders.model.site import Site
-from feeders.registry.registry import DesignedEstimator, WarmStart
+from feeders.registry import DesignedEstimator, WarmStart
 from gridsec.estimators.sequential import SuspicionRecord
 from service.report.voltages import busbar_phases
 from service.store.state_codec import KeptInvalid, StateSnapshot, decode_distrust, encode_distrust

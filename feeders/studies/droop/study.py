@@ -43,8 +43,8 @@ from feeders.studies.droop.verdict import (
     trajectories,
     worst,
 )
-from feeders.studies.journal import Progress, Where, worked
 from feeders.studies.operating import Bases
+from feeders.studies.running import Progress, Where, worked
 from feeders.util import word
 from gridsec.errors import InputInvalid, Problem, no_choice, raise_if_any
 from gridsec.grid.droop import PRESETS, Droop
@@ -225,7 +225,7 @@ def droop(
     `seed` is that of small deviations from equilibrium, and of the orders of generation.
 
     Raises NoInverters without inverters and without a preset; ValueError for an invalid band, or new
-        generation at an unknown customer; OtherStudy, InUse as `feeders.studies.journal.Journal`.
+        generation at an unknown customer; OtherStudy, InUse as `feeders.studies.running.Journal`.
     """
     given = options or DroopOptions()
     study = _Study(Subject.of(site), chosen_fleet(site, given.preset, given.who), given, seed)

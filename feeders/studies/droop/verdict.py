@@ -19,8 +19,7 @@ import numpy as np
 import pandas as pd
 
 from feeders.model.site import Site
-from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged
-from feeders.simulation.powerflow_three_phase import PlacesFlow, power_flow
+from feeders.simulation.powerflow import PlacesFlow, PowerFlow, PowerFlowDiverged, power_flow
 from feeders.studies.droop.fleets import inverter_names, point
 from feeders.studies.operating import Bases
 from gridsec.arrays import Floats

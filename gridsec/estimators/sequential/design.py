@@ -15,6 +15,7 @@ from scipy.special import ndtri
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible, NotObservable, Problem, raise_if_any
+from gridsec.estimators.detection import curve_mismatch
 from gridsec.estimators.plant import Plant, check_plant, judging_problems
 from gridsec.estimators.sequential.attack_kind import KindReferences, LoadTraces, look_interval, repeat_limits
 from gridsec.estimators.sequential.posterior import (
@@ -25,7 +26,6 @@ from gridsec.estimators.sequential.posterior import (
     voltage_prior,
 )
 from gridsec.estimators.sequential.search import Decoder, FaultDictionary
-from gridsec.estimators.thresholds import curve_mismatch
 from gridsec.grid.meter import ToldError, busbar_error, steady_rounding
 from gridsec.grid.network import Network, Power, Sensitivities
 from gridsec.observers.certificates import Certificate, certify, verify

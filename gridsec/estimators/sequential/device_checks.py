@@ -38,7 +38,7 @@ from itertools import product
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
-from gridsec.estimators.inputs import busbar_errors
+from gridsec.estimators.plant import busbar_errors
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.measurements import PowerErrors
 from gridsec.estimators.sequential.posterior import LeaveOneOut, Posterior

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices
-from gridsec.estimators.inputs import busbar_errors
+from gridsec.estimators.plant import busbar_errors
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.device_checks import (
     BusbarTest,

@@ -30,8 +30,7 @@ from math import ceil
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
-from gridsec.estimators.inputs import NO_VOLTAGE, busbar_errors, losses, usual
-from gridsec.estimators.plant import Plant
+from gridsec.estimators.plant import NO_VOLTAGE, Plant, busbar_errors, losses, usual
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.posterior import EXACT, FALSE_Q, UNMETERED, Prior, voltage_prior
 from gridsec.interface import Frame, PowerOrigin

@@ -23,7 +23,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices, submatrix
 from gridsec.errors import DesignInfeasible
-from gridsec.estimators.inputs import NO_VOLTAGE, busbar_errors
+from gridsec.estimators.plant import NO_VOLTAGE, busbar_errors
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.measurements import Measurements, PowerErrors
 from gridsec.estimators.sequential.state import (

@@ -24,9 +24,8 @@ from functools import partial
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, changed
-from gridsec.estimators.decision import DecisionInputs, decide
-from gridsec.estimators.inputs import NO_VOLTAGE, busbar_errors
-from gridsec.estimators.plant import Plant
+from gridsec.estimators.detection import DecisionInputs, decide
+from gridsec.estimators.plant import NO_VOLTAGE, Plant, busbar_errors
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.device_checks import BusbarTrust, track_busbar
 from gridsec.estimators.sequential.identify import Identification

@@ -19,8 +19,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
-from gridsec.estimators.inputs import NO_VOLTAGE
-from gridsec.estimators.plant import Plant
+from gridsec.estimators.plant import NO_VOLTAGE, Plant
 from gridsec.estimators.sequential.attack_kind import (
     BLOCKS,
     ROWS,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, all_of, any_of, changed
-from gridsec.estimators.inputs import nothing_new
+from gridsec.estimators.plant import nothing_new
 from gridsec.estimators.sequential.attack_kind import AttackKinds, classify, ingest, repeat_lags
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.device_checks import (

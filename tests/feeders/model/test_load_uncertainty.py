@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from feeders.format.tables import write
-from feeders.model.load_uncertainty import ALIKE, from_history, load_doubt, tell, unread
-from feeders.model.site import Site, from_tables, load, names
-from feeders.registry.registry import design
+from feeders.model.site import ALIKE, Site, from_history, from_tables, load, load_doubt, names, tell, unread
+from feeders.registry import design
 from feeders.simulation.scenario import START
 from gridsec.errors import InputInvalid
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialState

@@ -10,8 +10,7 @@ import pytest
 
 from feeders.model.site import Site, load, names, to_frame
 from feeders.simulation.demand import Customers, Variation
-from feeders.simulation.meters import BUSBAR, Channel, MeterErrors, MeterOutage
-from feeders.simulation.plant import ClosedLoop, Loads, substeps
+from feeders.simulation.plant import BUSBAR, Channel, ClosedLoop, Loads, MeterErrors, MeterOutage, substeps
 from feeders.simulation.powerflow import PowerFlow
 from feeders.simulation.scenario import (
     START,

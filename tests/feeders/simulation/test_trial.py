@@ -10,12 +10,11 @@ import numpy as np
 import pandapower as pp
 import pytest
 
-from feeders.model.load_uncertainty import load_doubt
-from feeders.model.site import Site, Snapshot, from_tables, load, to_frame
-from feeders.registry.registry import FAMILIES, DesignedEstimator, Estimator, choose, design
+from feeders.model.site import Site, Snapshot, from_tables, load, load_doubt, to_frame
+from feeders.registry import FAMILIES, DesignedEstimator, Estimator, choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec, NoSuchAttack, manipulations
 from feeders.simulation.demand import Customers
-from feeders.simulation.meters import Channel, MeterOutage
+from feeders.simulation.plant import Channel, MeterOutage
 from feeders.simulation.scenario import START, simulate
 from feeders.simulation.trial import FrameTruth, LoadError, Trial, TrialMeterErrors, frames, judge
 from gridsec.arrays import Floats

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 
 from feeders.model.three_phase import load_three_phase
-from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow
+from feeders.simulation.powerflow import UnbalancedPowerFlow
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible
 from gridsec.grid.droop import Droop, fleet

@@ -17,7 +17,7 @@ from feeders.model.site import load
 from feeders.simulation.powerflow import PowerFlow
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
-from gridsec.estimators.thresholds import curve_mismatch
+from gridsec.estimators.detection import curve_mismatch
 from gridsec.grid.droop import Droop, voltage_curve
 from gridsec.interface import Cause, Decision
 from gridsec.observers.lmi.sampled import DiscreteLure, advance

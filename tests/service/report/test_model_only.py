@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from feeders.model.site import Site, from_tables, load, to_frame
-from feeders.registry.registry import choose
-from feeders.simulation.meters import BUSBAR as BUSBAR_SOURCE
+from feeders.registry import choose
+from feeders.simulation.plant import BUSBAR as BUSBAR_SOURCE
 from gridsec.interface import Cause
 from service.alarms.conditions import AlarmKind, conditions
 from service.api.models import HistoryPoint

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from feeders.model.site import Site, load, to_frame
-from feeders.registry.registry import choose
-from feeders.simulation.meters import MeterErrors
+from feeders.registry import choose
+from feeders.simulation.plant import MeterErrors
 from feeders.simulation.scenario import Scenario, random_attacks, simulate
 from gridsec.attack import InverterAttack
 from gridsec.interface import Cause, Decision, Estimate, Explanation, ManipulationKind, Verdict

@@ -13,8 +13,7 @@ import pytest
 from feeders.format.tables import CustomerRow, FeederMeta, FeederTables, LineRow
 from feeders.model.site import Site, from_tables
 from feeders.simulation.plant import ClosedLoop, Loads
-from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged
-from feeders.simulation.powerflow_three_phase import power_flow
+from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged, power_flow
 from feeders.studies.droop.fleets import Who, box, equip, point
 from feeders.studies.droop.limits import (
     BandGuarantee,
@@ -40,7 +39,7 @@ from feeders.studies.droop.verdict import (
     steps,
     trajectories,
 )
-from feeders.studies.journal import OtherStudy
+from feeders.studies.running import OtherStudy
 from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid, InputInvalid
 from gridsec.grid.droop import Droop

@@ -12,8 +12,7 @@ import pytest
 from feeders.format.tables import FeederTables, LineRow
 from feeders.model.site import Site, from_tables
 from feeders.simulation.plant import ClosedLoop, Loads
-from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged
-from feeders.simulation.powerflow_three_phase import power_flow
+from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged, power_flow
 from feeders.studies.droop.fleets import Who, box, equip, made, point
 from feeders.studies.droop.limits import (
     BandGuarantee,

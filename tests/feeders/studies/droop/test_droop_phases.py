@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from feeders.model.site import Site, from_tables, load
-from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow
+from feeders.simulation.powerflow import UnbalancedPowerFlow
 from feeders.studies.droop.fleets import Who, box, equip, point
 from feeders.studies.droop.limits import BandGuarantee, Conditions, DroopPlan, checked, ratings_pu, safety
 from feeders.studies.droop.verdict import FleetVerdict, Subject, inverter_rows, judge, longest_interval

@@ -14,8 +14,8 @@ from scipy.stats import norm
 
 from benchmarks.kinds import CLOCK_S, DELAY_S, Seen, attacks, watch
 from feeders.model.site import Site, load, to_frame
-from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, choose, design
-from feeders.simulation.meters import MeterErrors
+from feeders.registry import SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.simulation.plant import MeterErrors
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Bias, Replay

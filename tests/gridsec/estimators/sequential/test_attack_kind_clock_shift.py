@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from benchmarks.slow_kinds import Days, Seen, lied, played, read_every, watch
 from feeders.model.site import Site, load
-from feeders.registry.registry import DesignedEstimator, design
+from feeders.registry import DesignedEstimator, design
 from gridsec.arrays import Floats
 from gridsec.estimators.sequential import attack_kind
 from gridsec.interface import ManipulationKind

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from feeders.model.equipment import find
-from feeders.model.load_uncertainty import load_doubt
-from feeders.model.site import Site, from_tables, load, one_phase_each
-from feeders.registry.registry import design as design_site
-from feeders.simulation.powerflow_three_phase import power_flow
+from feeders.model.site import Site, from_tables, load, load_doubt, one_phase_each
+from feeders.registry import design as design_site
+from feeders.simulation.powerflow import power_flow
 from feeders.simulation.trial import AttackKind, AttackSpec, LoadError, Trial, TrialMeterErrors, frames
 from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant

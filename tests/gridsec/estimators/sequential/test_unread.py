@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import load, to_frame
-from feeders.registry.registry import design
+from feeders.registry import design
 from feeders.simulation.scenario import Scenario, simulate, snapshots
 from gridsec.attack import Attack, Replay, Stuck
 from gridsec.estimators.sequential import SuspicionRecord, distrusted, init, warm_start
