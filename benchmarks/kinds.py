@@ -122,14 +122,14 @@ def cost(name: str, ticks: int = 4200) -> str:
     watcher = design(choose(load(name), estimator=SEQUENTIAL))
     shapes, random = watcher.design.references, np.random.default_rng(0)
     p = shapes.limits.step.size
-    live, nobody, state, times = np.ones(p, np.bool_), np.zeros(p, np.bool_), attack_kind.empty(p), []
+    live, none, state, times = np.ones(p, np.bool_), np.zeros(p, np.bool_), attack_kind.no_kinds(p), []
     for k in range(ticks):
         v = 1.0 + 0.01 * np.sin(k / 500.0) + 5e-4 * random.standard_normal(p)
         y = (np.rint(v / shapes.limits.step) * shapes.limits.step) ** 2
         begin = process_time()
         heard = attack_kind.ingest(shapes, state, y, live)
         attack_kind.repeat_lags(heard)
-        state = attack_kind.classify(shapes, heard, y, y, nobody, y)
+        state = attack_kind.classify(shapes, heard, y, y, none, y)
         times.append(process_time() - begin)
     kept = state.history.blocks
     size = sum(b.code.nbytes + b.hash.nbytes + b.model.nbytes + b.own.nbytes for b in kept) / 1e6

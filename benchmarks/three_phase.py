@@ -28,7 +28,7 @@ from feeders.model.three_phase import ThreePhaseSite, load_three_phase
 from feeders.simulation.powerflow import UnbalancedPowerFlow, sequence_ohm
 from gridsec.arrays import Floats, Phasors, spectral_radius
 from gridsec.errors import DesignInfeasible
-from gridsec.grid.droop import fleet
+from gridsec.grid.devices import fleet
 from gridsec.grid.three_phase import bus_voltages, lindist3flow, model_error_bound, sensitivities
 from gridsec.observers.certificates import reactance, small_gain
 from gridsec.observers.lure import close_loop

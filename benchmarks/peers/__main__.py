@@ -56,16 +56,16 @@ def _run(wanted: argparse.Namespace) -> tuple[report.Scores, report.Scores]:
     single: report.Scores = {}
     minute: report.Scores = {}
     for feeder in wanted.feeders:
-        here, everybody = prepared(feeder)
+        here, every = prepared(feeder)
         voter = Greedy(here, 3.5)
         for cell in cells((feeder,)):
             clean = cell.attack == "clean"
             trials = wanted.clean if clean else wanted.trials
-            single[cell] = measure(cell, here, everybody, trials=trials, panda=min(trials, wanted.panda))
+            single[cell] = measure(cell, here, every, trials=trials, panda=min(trials, wanted.panda))
             print(report.line(cell, single[cell]), flush=True)
             if wanted.minute:
                 few = min(wanted.minute, wanted.panda)
-                minute[cell] = measure(cell, here, everybody, trials=wanted.minute, panda=few, seconds=60)
+                minute[cell] = measure(cell, here, every, trials=wanted.minute, panda=few, seconds=60)
                 minute[cell]["pgm votes"] = votes(cell, here, voter, trials=wanted.minute, seconds=60)
                 minute[cell][SERVED] = watched(cell, here, trials=wanted.minute, seconds=60)
                 print("60 s", report.line(cell, minute[cell]), flush=True)

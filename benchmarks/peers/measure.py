@@ -78,20 +78,20 @@ def methods(here: Scene) -> dict[str, Method]:
 
 
 def measure(
-    cell: Cell, here: Scene, everybody: dict[str, Method], *, trials: int, panda: int, seconds: int = 1
+    cell: Cell, here: Scene, every: dict[str, Method], *, trials: int, panda: int, seconds: int = 1
 ) -> dict[str, Score]:
     """One cell: every method sees the same snapshots, one after the other.
 
     With `seconds`, everybody gets the mean of the readings, with its smaller standard deviation.
     """
-    scores = {name: Score() for name in everybody}
+    scores = {name: Score() for name in every}
     if PANDA in scores:
         scores[PANDA].seen = 0
-    times: dict[str, list[float]] = {name: [] for name in everybody}
+    times: dict[str, list[float]] = {name: [] for name in every}
     for trial in range(trials):
         told = snapshot(here, cell, np.random.default_rng([_SEED, trial, cell.liars]), seconds)
         given = mean(told)
-        for name, method in everybody.items():
+        for name, method in every.items():
             if name == PANDA and trial >= panda:
                 continue
             start = time.perf_counter()
@@ -175,8 +175,8 @@ def _count(score: Score, answer: Answer, told: Snapshot) -> None:
 def prepared(feeder: str) -> tuple[Scene, dict[str, Method]]:
     """A feeder with all methods, each run once on a clean snapshot, so that caches are warm."""
     here = scene(feeder)
-    everybody = methods(here)
+    every = methods(here)
     told = snapshot(here, Cell(feeder, *NOISES[0]), np.random.default_rng(0))
-    for method in everybody.values():
+    for method in every.values():
         method(mean(told))
-    return here, everybody
+    return here, every

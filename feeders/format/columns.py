@@ -12,6 +12,7 @@ import io
 import math
 import re
 import tomllib
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import KW_ONLY, MISSING, dataclass, field, fields, replace
 from importlib.metadata import entry_points
@@ -49,7 +50,7 @@ def shown(cell: object) -> str:
 
 
 @dataclass(frozen=True)
-class Column:
+class Column(ABC):
     """One column, or one key of feeder.toml."""
 
     meaning: str
@@ -82,8 +83,9 @@ class Column:
     def _complaint(self, code: str, text: str) -> CellInvalid:
         return CellInvalid(code, f"{text}; expected {self.right} ({self.meaning})")
 
+    @abstractmethod
     def _value(self, cell: object) -> Any:
-        raise NotImplementedError
+        """Value of a cell that is present."""
 
     def _check_choices(self, values: Collection[str]) -> None:
         for value in values:

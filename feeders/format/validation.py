@@ -33,7 +33,7 @@ from feeders.format.columns import (
 from feeders.profiles import load_names, pv_names
 from gridsec.arrays import Bools, Floats, Phasors
 from gridsec.errors import Problem
-from gridsec.grid.droop import PRESETS
+from gridsec.grid.devices import PRESETS
 
 SAME_LEVEL: Final = 1e-6
 """Relative difference of two nominal voltages that count as equal: 230.94 and 400 / sqrt(3)."""

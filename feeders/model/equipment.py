@@ -28,8 +28,7 @@ from feeders.format.validation import Tree, closed_tree, nominal_volts
 from feeders.profiles import data_root
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
 from gridsec.errors import FeederInvalid, Problem
-from gridsec.grid.droop import Droop, fleet
-from gridsec.grid.meter import MeterAccuracy
+from gridsec.grid.devices import Droop, MeterAccuracy, fleet
 
 # Reported active powers beyond this factor of the customer's range, and this power, are implausible.
 CREDIBLE_FACTOR = 10.0

@@ -30,7 +30,7 @@ from feeders.simulation.powerflow import PlacesFlow, PowerFlow, PowerFlowDiverge
 from gridsec.arrays import Floats, Ints
 from gridsec.attack import InverterAttack
 from gridsec.errors import GridsecError, InputInvalid, Problem, raise_if_any
-from gridsec.grid.droop import Droop
+from gridsec.grid.devices import Droop
 from gridsec.grid.network import InPhases
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from feeders.model.three_phase import ThreePhaseSite
 from feeders.studies.unobservable import CurvePositions, customer_indices
 from gridsec.arrays import Floats
 from gridsec.errors import choice
-from gridsec.grid.meter import busbar_error, reading_error
+from gridsec.grid.devices import busbar_error, reading_error
 from gridsec.grid.network import Power
 from gridsec.interface import Frame
 from gridsec.planning.redundancy import from_busbar

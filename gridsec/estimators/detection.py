@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, any_of, frozen
-from gridsec.grid.droop import Droop, voltage_curve
+from gridsec.grid.devices import Droop, voltage_curve
 from gridsec.grid.network import LinDistFlow
 from gridsec.interface import Cause, Decision
 from gridsec.observers.lure import StepPolicy, rest

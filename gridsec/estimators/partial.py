@@ -73,7 +73,7 @@ from gridsec.estimators.plant import (
     reconstruct,
     usual_options,
 )
-from gridsec.grid.meter import reading_error
+from gridsec.grid.devices import reading_error
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.observers import circle
 from gridsec.observers.certificates import Certificate, verify

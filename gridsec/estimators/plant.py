@@ -14,8 +14,7 @@ from gridsec.arrays import Bools, Floats, Ints, all_of
 from gridsec.errors import Problem, raise_if_any
 from gridsec.estimators import detection
 from gridsec.estimators.detection import ErrorModel, TickUncertainty, error_model
-from gridsec.grid.droop import Droop
-from gridsec.grid.meter import MeterAccuracy, busbar_error, reading_error
+from gridsec.grid.devices import Droop, MeterAccuracy, busbar_error, reading_error
 from gridsec.grid.network import LinDistFlow, Network
 from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
 

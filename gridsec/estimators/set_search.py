@@ -67,7 +67,7 @@ from gridsec.estimators.plant import (
     usual_options,
 )
 from gridsec.estimators.single_tick import MOST_SETS
-from gridsec.grid.meter import reading_error
+from gridsec.grid.devices import reading_error
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.observers.certificates import Certificate, certify
 from gridsec.observers.lure import close_loop

@@ -364,7 +364,7 @@ def report(
     from feeders.format.columns import ESTIMATORS
     from feeders.studies.protect import check as see_question
     from gridsec.errors import no_choice
-    from gridsec.grid.droop import PRESETS
+    from gridsec.grid.devices import PRESETS
 
     problems: list[str] = []
     chosen = _studies(studies, tuple(STUDIES), recorded=readings is not None, problems=problems)

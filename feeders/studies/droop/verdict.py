@@ -24,7 +24,7 @@ from feeders.studies.droop.fleets import inverter_names, point
 from feeders.studies.operating import Bases
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, FeederInvalid
-from gridsec.grid.droop import Droop, voltage_curve
+from gridsec.grid.devices import Droop, voltage_curve
 from gridsec.planning.droop.ac_sensitivity import InjectionBox, PhasorNetwork, network, sensitivity
 from gridsec.planning.droop.equilibrium import Share, injected, rest, shares, shares_of_gain
 from gridsec.planning.droop.stability import Loop, Update, growth, loop, proof, reach, slopes, steepened

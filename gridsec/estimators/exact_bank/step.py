@@ -53,7 +53,7 @@ from gridsec.estimators.plant import (
     reconstruct,
     usual_options,
 )
-from gridsec.grid.meter import reading_error
+from gridsec.grid.devices import reading_error
 from gridsec.grid.network import LinDistFlow
 from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.certificates import Certificate, certify, small_gain, verify

@@ -26,7 +26,7 @@ from gridsec.estimators.sequential.posterior import (
     voltage_prior,
 )
 from gridsec.estimators.sequential.search import Decoder, FaultDictionary
-from gridsec.grid.meter import ToldError, busbar_error, steady_rounding
+from gridsec.grid.devices import ToldError, busbar_error, steady_rounding
 from gridsec.grid.network import Network, Power, Sensitivities
 from gridsec.observers.certificates import Certificate, certify, verify
 from gridsec.observers.lmi import contraction

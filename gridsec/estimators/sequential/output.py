@@ -47,7 +47,7 @@ from gridsec.estimators.sequential.posterior import (
 )
 from gridsec.estimators.sequential.state import SequentialState, TrustState
 from gridsec.estimators.sequential.time_scales import min_readings
-from gridsec.grid.meter import told_error
+from gridsec.grid.devices import told_error
 from gridsec.grid.three_phase import PHASES
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, PowerOrigin, Verdict
 

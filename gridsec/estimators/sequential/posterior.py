@@ -68,8 +68,7 @@ from scipy.special import expit
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices, submatrix
 from gridsec.errors import Problem, raise_if_any
-from gridsec.grid.droop import Droop
-from gridsec.grid.meter import MeterAccuracy
+from gridsec.grid.devices import Droop, MeterAccuracy
 from gridsec.grid.network import Network, Power, Sensitivities
 
 

@@ -56,7 +56,7 @@ from feeders.format.validation import Edge, tree
 from feeders.model.site import find, load
 from feeders.profiles import load_names, pv_names
 from gridsec.errors import FeederInvalid
-from gridsec.grid.droop import PRESETS
+from gridsec.grid.devices import PRESETS
 from tests.codes import codes_of
 
 CASES = Path(__file__).parents[2] / "cases"

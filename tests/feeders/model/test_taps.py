@@ -18,7 +18,7 @@ from feeders.simulation.powerflow import Grid, PlacesFlow, PowerFlow, Unbalanced
 from feeders.studies.detectable import detectable
 from feeders.studies.protect import Goal, protect
 from gridsec.errors import FeederInvalid
-from gridsec.grid.droop import preset
+from gridsec.grid.devices import preset
 from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.three_phase import bus_voltages as phase_voltages
 from gridsec.grid.three_phase import model_error_bound as phase_error_bound

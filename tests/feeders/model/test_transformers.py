@@ -18,7 +18,7 @@ from feeders.simulation.plant import ClosedLoop, Loads
 from feeders.simulation.powerflow import PowerFlow, UnbalancedPowerFlow, power_flow
 from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid
-from gridsec.grid.droop import preset
+from gridsec.grid.devices import preset
 from tests.feeders import stations
 from tests.feeders.stations import LV, MV
 

@@ -24,7 +24,7 @@ from feeders.simulation.scenario import (
 )
 from gridsec.attack import Bias, Replay, Stuck
 from gridsec.errors import InputInvalid
-from gridsec.grid.droop import voltage_curve
+from gridsec.grid.devices import voltage_curve
 from tests.codes import refused
 from tests.feeders.villages import village, village_without_inverters
 

@@ -254,8 +254,8 @@ def test_a_meter_without_a_reading_has_no_influence_and_is_not_accused(decoder: 
     ):
         np.testing.assert_array_equal(first.meters, second.meters)
         assert not first.meters[[1, 6]].any()
-    nobody = decoder(made.evidence(np.where(live, 0.0, m), np.zeros(8, dtype=bool)))
-    assert not nobody[0].meters.any()
+    empty = decoder(made.evidence(np.where(live, 0.0, m), np.zeros(8, dtype=bool)))
+    assert not empty[0].meters.any()
 
 
 def prepare(plant: Plant, decoder: Decoder, *, step_s: float = 1.0, most: int = 2) -> SequentialDesign:

@@ -22,7 +22,7 @@ from gridsec.estimators.sequential.device_checks import (
 from gridsec.estimators.sequential.measurements import PowerErrors
 from gridsec.estimators.sequential.output import explanations_sentence
 from gridsec.estimators.sequential.posterior import condition, leave_one_out, voltage_prior
-from gridsec.grid.meter import busbar_error
+from gridsec.grid.devices import busbar_error
 from gridsec.interface import Cause, Decision, Explanation, Frame
 from tests.gridsec.estimators.sequential.test_monitor import Answers, prepare, watch
 from tests.gridsec.estimators.sequential.test_phases import apart
@@ -80,8 +80,8 @@ class TestOneMore:
         return said / np.sqrt(1.0 / precision + design.busbar**2)
 
     def test_its_residual_is_that_of_leaving_it_out(self) -> None:
-        everybody, nothing = np.ones(CUSTOMERS, dtype=np.bool_), np.zeros(CUSTOMERS)
-        now = condition(self.design.prior, self.noise, everybody)
+        every, nothing = np.ones(CUSTOMERS, dtype=np.bool_), np.zeros(CUSTOMERS)
+        now = condition(self.design.prior, self.noise, every)
         shift = np.ones(CUSTOMERS)
         # Move all readings until exactly that many standard deviations are reached.
         slope = self.sigmas(self.m + shift) - self.sigmas(self.m)
@@ -119,13 +119,13 @@ class TestOneMore:
         """By the matrices of the linear model: all that errs does so in the worst direction."""
         design, rng = self.design, np.random.default_rng(8)
         plant, model = design.plant, design.plant.feeder.linear()
-        everybody, none = np.ones(CUSTOMERS, dtype=np.bool_), np.zeros(CUSTOMERS, dtype=np.bool_)
-        now, fixed = condition(design.prior, self.noise, everybody), rng.uniform(0.0, 1e-3, CUSTOMERS)
+        every, none = np.ones(CUSTOMERS, dtype=np.bool_), np.zeros(CUSTOMERS, dtype=np.bool_)
+        now, fixed = condition(design.prior, self.noise, every), rng.uniform(0.0, 1e-3, CUSTOMERS)
         errors, nothing = rng.uniform(0.01, 0.05, CUSTOMERS), np.zeros(CUSTOMERS)
         frame = Street(plant, rng).frame()
         p_error, q_error = (errors, nothing) if active else (nothing, errors)
         frame = replace(frame, p_error=p_error, q_error=q_error)
-        powers = PowerErrors(frame, frame.q, none, frame.v0_squared, everybody, design.faults.std)
+        powers = PowerErrors(frame, frame.q, none, frame.v0_squared, every, design.faults.std)
         honest = HonestErrors(powers, np.zeros(plant.droop.tau.size))
         v = now.Q.sum(axis=0) / now.Q.sum()
         moved = 2.0 * (model.R_bus if active else model.X_bus)[design.prior.meters]

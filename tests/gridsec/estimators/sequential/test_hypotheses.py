@@ -30,8 +30,7 @@ from gridsec.estimators.sequential.search import (
     set_cost,
 )
 from gridsec.estimators.sequential.time_scales import Scales, ScaleTest, push, scale_test, update_posterior
-from gridsec.grid.droop import fleet
-from gridsec.grid.meter import MeterAccuracy
+from gridsec.grid.devices import MeterAccuracy, fleet
 from gridsec.grid.network import Power
 from gridsec.grid.radial import Feeder
 from gridsec.interface import Frame
@@ -72,10 +71,10 @@ def search(design: SequentialDesign, m: Floats) -> Candidates:
 
 def prepared(design: SequentialDesign, m: Floats) -> tuple[HypothesisSearch, Posterior, ScaleTest]:
     """The search itself, and what it begins with."""
-    state, everybody = sequential.init(design, 0.0), np.ones(m.size, dtype=np.bool_)
-    window = push(state.window, design.lengths, m, everybody)
+    state, all_meters = sequential.init(design, 0.0), np.ones(m.size, dtype=np.bool_)
+    window = push(state.window, design.lengths, m, all_meters)
     scales = Scales(design, state.uncertainty, window, state.learned, np.zeros(m.size))
-    now = update_posterior(None, scales[0], everybody, None)
+    now = update_posterior(None, scales[0], all_meters, None)
     view = scale_test(design, scales[0], leave_one_out(now, scales[0].m))
     return HypothesisSearch(design, scales, state.full_posteriors, state.trust, 0), now, view
 

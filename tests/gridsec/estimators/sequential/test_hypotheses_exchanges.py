@@ -14,7 +14,7 @@ from gridsec.estimators.sequential.hypotheses import fault_exchanges
 from gridsec.estimators.sequential.posterior import LoadDoubt as Doubt
 from gridsec.estimators.sequential.posterior import add_unknown, condition, leave_one_out, voltage_prior
 from gridsec.estimators.sequential.search import Candidate, FaultDictionary
-from gridsec.grid.droop import fleet
+from gridsec.grid.devices import fleet
 from gridsec.interface import Cause, Decision, Verdict
 from tests.gridsec.street import BASE_KVA, Street, accuracy, make_plant, random_tree
 

@@ -18,7 +18,7 @@ from gridsec.estimators.sequential.observer import advance_inverters
 from gridsec.estimators.sequential.posterior import injection_doubt, voltage_prior
 from gridsec.estimators.sequential.state import ModelDriven
 from gridsec.estimators.sequential.time_scales import empty, forget, push, shift
-from gridsec.grid.droop import fleet
+from gridsec.grid.devices import fleet
 from tests.codes import refused
 from tests.gridsec.street import ac_voltages, accuracy, make_plant, random_tree
 

@@ -16,9 +16,8 @@ from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialOptions
 from gridsec.estimators.sequential.posterior import voltage_prior
-from gridsec.grid.droop import Droop
+from gridsec.grid.devices import Droop, MeterAccuracy
 from gridsec.grid.meshed import MeshedFeeder, PhasedMesh
-from gridsec.grid.meter import MeterAccuracy
 from gridsec.grid.network import InPhases
 from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.radial import Feeder

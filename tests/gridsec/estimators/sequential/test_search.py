@@ -224,8 +224,8 @@ def test_swaps_are_what_the_cost_rises_by() -> None:
     found = descend(condition(p, noise, available), m, available, limits(5), keep=none)
     accused = np.flatnonzero(~found.posterior.trusted)
     assert accused.size >= 1
-    anybody, honest = replace(limits(5), sigmas=1e9), set()
-    everything = meter_exchanges(found, available, 50.0, anybody)
+    any_meter, honest = replace(limits(5), sigmas=1e9), set()
+    everything = meter_exchanges(found, available, 50.0, any_meter)
     for swap in everything:
         trusted = found.posterior.trusted.copy()
         trusted[swap.accused], trusted[swap.innocent] = True, False
@@ -236,7 +236,7 @@ def test_swaps_are_what_the_cost_rises_by() -> None:
         if abs(now.residual[swap.accused]) <= limits(5).limit(now.std)[swap.accused]:
             honest.add(swap.accused)
     assert {swap.accused for swap in meter_exchanges(found, available, 50.0, limits(5))} == honest
-    assert meter_exchanges(found, available, -1.0, anybody) == []
+    assert meter_exchanges(found, available, -1.0, any_meter) == []
 
 
 def test_nobody_is_exchanged_who_would_be_accused_again() -> None:

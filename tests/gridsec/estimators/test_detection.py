@@ -14,8 +14,7 @@ from scipy.integrate import solve_ivp
 from gridsec.errors import InputInvalid
 from gridsec.estimators import detection
 from gridsec.estimators.detection import ErrorBound, Motion, TickUncertainty
-from gridsec.grid.droop import PRESETS, fleet
-from gridsec.grid.meter import MeterAccuracy, busbar_error, reading_error
+from gridsec.grid.devices import PRESETS, MeterAccuracy, busbar_error, fleet, reading_error
 from tests.codes import refused
 from tests.gridsec.street import make_plant, random_tree
 
@@ -116,12 +115,12 @@ def problem(
 ) -> tuple[detection.ErrorModel, TickUncertainty]:
     plant = make_plant(rng, customers=customers, drop=0.04)
     model = detection.error_model(plant.droop, plant.feeder.linear(), plant.meters, M)
-    nobody = np.zeros(customers, dtype=bool)
+    empty = np.zeros(customers, dtype=bool)
     now = TickUncertainty(
         base=rng.uniform(0.0, 0.01, customers),
         reading=rng.uniform(0.005, 0.02, customers),
         live=np.ones(customers, dtype=bool),
-        told=nobody,
+        told=empty,
         extra=np.zeros(customers),
     )
     return model, now
