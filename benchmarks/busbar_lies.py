@@ -1,4 +1,4 @@
-"""A busbar meter that lies: whether it is named, and nobody honest.
+"""A manipulated busbar meter: names of it, and of no honest meter.
 
     python -m benchmarks.busbar_lies [seeds]
 

@@ -1,4 +1,4 @@
-"""Whether the 95 % intervals of a calibration hold: recordings of feeders whose files are right.
+"""Coverage of the 95 % intervals of a calibration, on recordings of feeders with correct files.
 
     python -m benchmarks.calibrate_intervals [recordings] [feeder ...] [--days 4] [--step 900]
 

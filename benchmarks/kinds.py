@@ -59,7 +59,7 @@ def attacks(site: Site, kind: str, seed: int) -> tuple[tuple[Attack, ...], float
 
 
 def watch(site: Site, watcher: DesignedEstimator, scenario: Scenario) -> Seen:
-    """Play a scenario and remember what was said of whom."""
+    """Play a scenario and keep the kinds given to each meter."""
     liars = {int(j) for attack in scenario.attacks for j in attack.meters}
     on = min((attack.t_on for attack in scenario.attacks), default=START)
     state, seen = watcher.init(START), Seen()

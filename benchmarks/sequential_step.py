@@ -112,7 +112,7 @@ class Measured:
     Attributes
     ----------
     steady
-        Median of the steps in which nobody lies.
+        Median of the steps without manipulation.
     median, mean
         Of the steps of an attack.
     search, largest

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -46,22 +46,26 @@ from gridsec.observers.gains import CircleGains, CircleOptions, options_for, sta
 from gridsec.observers.lure import Lure, close_loop
 from gridsec.secure.subsets import subsets
 
-if TYPE_CHECKING:
-    from feeders.model.site import Site
-
 __all__ = [
     "DIRECT",
     "FAMILIES",
     "LMI",
     "SEQUENTIAL",
+    "BankGains",
     "BiasLearning",
+    "DesignCache",
     "DesignOptions",
     "DesignedEstimator",
     "Estimator",
+    "EstimatorUnusable",
     "WarmStart",
+    "bank_gains",
+    "cache_folder",
     "choose",
     "design",
+    "design_foreign",
     "lmi_options",
+    "load_foreign",
 ]
 
 

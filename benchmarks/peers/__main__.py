@@ -1,4 +1,4 @@
-"""Who finds manipulated meters, side by side: `python -m benchmarks.peers [--trials N] [--write docs]`.
+"""Comparison with open tools: `python -m benchmarks.peers [--trials N] [--write docs]`.
 
 Without `--write` a short run that prints its tables. With it, docs/peers.md and its figures are written.
 """
@@ -20,7 +20,7 @@ FEEDERS = ("rural1-behind", "rural3-behind")
 def main() -> int:
     """Measure, print, and write if asked for.
 
-    Exits 1 if ours names somebody too often in any clean cell, or if a peer is exact more often in any other
+    Exits 1 if ours names a meter too often in any clean cell, or if a peer is exact more often in any other
     one; in both beyond what may be chance.
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks.peers", description=__doc__)

@@ -112,7 +112,7 @@ class SetSearchState:
     x: Floats  # (m,) its estimate, pu
     z: Floats  # (m,) its z at the inverters, squared pu
     y: Floats  # (p,) last readings as z, squared pu; NaN where missing
-    # bound, level: bounds on its error if no trusted meter is manipulated, see `thresholds.advance`
+    # bound, level: bounds on its error if no trusted meter is manipulated, see `detection.advance`
     bound: ErrorBound
     level: ErrorBound
     # (m,) bound on the error of inverters with an unmanipulated own meter, under any other attack, pu

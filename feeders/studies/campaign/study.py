@@ -483,7 +483,7 @@ YEAR_S: Final = 365.25 * 86_400.0
 
 
 def scenarios(rows: Sequence[dict[str, Any]]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Tables of all scenarios, and of all manipulated devices, from the rows of `scene.watch`."""
+    """Tables of all scenarios, and of all manipulated devices, from the rows of `watch`."""
     kept = ("scenario", "alarms_per_year", "kind", "size", "liars", "place")
     each = [{name: row[name] for name in kept} | one for row in rows for one in row.get("each", ())]
     frame = pd.DataFrame([{name: cell for name, cell in row.items() if name != "each"} for row in rows])
