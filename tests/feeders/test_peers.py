@@ -14,6 +14,7 @@ import pytest
 from benchmarks.peers import report
 from benchmarks.peers.answer import Method
 from benchmarks.peers.measure import (
+    _SEED,
     OURS,
     PANDA,
     PEERS,
@@ -29,6 +30,7 @@ from benchmarks.peers.ours import Covariance
 from benchmarks.peers.scene import SIZE, Cell, Scene, mean, scene, snapshot
 from benchmarks.peers.served import frame, suspects, watch
 from gridsec.estimators import sequential
+from gridsec.interface import Cause
 
 FEEDER = "rural1-behind"
 Prepared = tuple[Scene, dict[str, Method]]
@@ -170,3 +172,18 @@ def test_a_false_report_accuses_no_honest_neighbour_and_not_the_busbar(
         assert not verdict.busbar.any()
         assert not (verdict.suspects & ~told.liars).any()
     np.testing.assert_array_equal(verdict.suspects, told.liars)
+
+
+def test_rival_with_a_false_power_prevents_the_name_of_an_honest_meter() -> None:
+    """Meters 5 and 12 and the power of 12 are false; three honest meters are the cheaper explanation."""
+    here, liars = scene(FEEDER), 2
+    cell = Cell(FEEDER, 0.005, 0.3, "coord+pq", liars)
+    told = snapshot(here, cell, np.random.default_rng([_SEED, 26, liars]), 60)
+    assert np.flatnonzero(told.liars).tolist() == [5, 12]
+    design = watch(here, told)
+    state, reasons = sequential.init(design, 0.0), []
+    for t in range(60):
+        state, _, verdict = sequential.step(design, state, frame(told, t))
+        assert not (verdict.suspects & ~told.liars).any()
+        reasons.append(verdict.cause)
+    assert reasons[-1] is Cause.AMBIGUOUS

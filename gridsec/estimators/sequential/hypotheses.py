@@ -488,11 +488,11 @@ class HypothesisSearch:
         return tuple(out.values())
 
     def relief(self, best: Hypothesis, other: Hypothesis) -> float:
-        """Part of another hypothesis's cost that does not count beside the best one.
+        """Part of another hypothesis's cost that does not count beside the best one of similar size.
 
-        The surcharge beyond `max_attacked` keeps the estimate on the side of the majority. It is not evidence
-        against a manipulated majority: it does not count against a hypothesis that accuses a group of similar
-        size.
+        The surcharge beyond `max_attacked` keeps the estimate on the side of the majority; it is not evidence
+        against a manipulated majority. The charge of a suspect's false power beyond one accusation keeps the
+        search from explaining noise; it is not evidence against a device with false voltage and power.
         """
         available = self.here.enough
         ours, theirs = (int(np.count_nonzero(available & ~each.trusted)) for each in (best, other))
@@ -504,7 +504,10 @@ class HypothesisSearch:
         def surcharge(suspects: int) -> float:
             return set_cost(size, suspects, most) - set_cost(size, suspects)
 
-        return surcharge(theirs) - surcharge(ours)
+        own = np.array([k for k in other.faults if k < self.faults.std.size], dtype=np.intp)
+        own = own[self.faults.beside_suspect(own, other.trusted)]
+        beyond = np.maximum(self.faults.charges(own, other.trusted, theirs) - 1.0, 0.0)
+        return surcharge(theirs) - surcharge(ours) + float(beyond.sum()) * set_cost(size, 1)
 
     def _reversal_cost(self, best: Candidate, other: Hypothesis) -> float:
         """Cost of a rival where groups change sides and each group has one common offset; infinite elsewhere.

@@ -97,9 +97,13 @@ class FaultDictionary:
     weighted: Callable[[Floats], Floats]  # `along(weights)`: weighted sum of its changes at the meters, (k,)
 
     def charges(self, which: Ints, trusted: Bools, suspects: int) -> Floats:
-        """Cost of accusing directions (c,), in accusations of a meter; liars: number of suspects."""
-        charge, of_liar = self.charge[which], (self.meter[which] >= 0) & ~trusted[self.meter[which]]
-        return np.where(of_liar, np.minimum(charge, false_power_charge(suspects)), charge)
+        """Cost of accusing directions (c,), in accusations of a meter; suspects: number of suspect meters."""
+        charge, own = self.charge[which], self.beside_suspect(which, trusted)
+        return np.where(own, np.minimum(charge, false_power_charge(suspects)), charge)
+
+    def beside_suspect(self, which: Ints, trusted: Bools) -> Bools:
+        """Directions (c,) that are the power of a customer with a suspect meter, (c,)."""
+        return np.asarray((self.meter[which] >= 0) & ~trusted[self.meter[which]])
 
     def reduced(self) -> FaultDictionary:
         """Fault dictionary with reduced charges, for searching alternative explanations."""

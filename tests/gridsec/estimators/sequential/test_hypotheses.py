@@ -367,3 +367,23 @@ def test_fits_of_exact_meters_are_not_made_from_a_kept_one() -> None:
     found, anew = made._condition(trusted), condition(prior, noise, trusted)
     assert found.updates == 0
     np.testing.assert_array_equal(found.Q, anew.Q)
+
+
+def test_a_false_power_beside_its_own_suspect_counts_once_between_similar_groups() -> None:
+    """A device with false voltage and power is a rival at the price of two accusations, not three."""
+    design = two_streets()
+    made, now, view = prepared(design, np.zeros(NEAR + FAR))
+    best = made.likeliest(now, view).best
+    one = set_cost(NEAR + FAR, 1)
+
+    def of(meters: list[int], powers: tuple[int, ...]) -> Hypothesis:
+        trusted = np.ones(NEAR + FAR, dtype=np.bool_)
+        trusted[meters] = False
+        return Hypothesis(trusted, powers, 0.0, 0.0)
+
+    two = replace(best, trusted=of([3, 4], ()).trusted)
+    assert made.relief(two, of([7, 8], (8,))) == pytest.approx((false_power_charge(2) - 1.0) * one)
+    assert made.relief(two, of([7, 8], ())) == 0.0
+    assert made.relief(two, of([7, 8], (9,))) == 0.0  # meter 9 is not a suspect
+    assert made.relief(two, of([7, 8, 9, 10], (8,))) == 0.0  # more than twice as many accusations
+    assert made.relief(of([3, 4], (4,)), of([7, 8], ())) == 0.0  # the best hypothesis gets none
