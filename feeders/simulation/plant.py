@@ -31,7 +31,7 @@ from gridsec.arrays import Floats, Ints
 from gridsec.attack import InverterAttack
 from gridsec.errors import GridsecError, InputInvalid, Problem, raise_if_any
 from gridsec.grid.devices import Droop
-from gridsec.grid.network import InPhases
+from gridsec.grid.phased import InPhases
 
 if TYPE_CHECKING:
     from feeders.model.site import Site

@@ -18,8 +18,7 @@ from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, Sequentia
 from gridsec.estimators.sequential.posterior import voltage_prior
 from gridsec.grid.devices import Droop, MeterAccuracy
 from gridsec.grid.meshed import MeshedFeeder, PhasedMesh
-from gridsec.grid.network import InPhases
-from gridsec.grid.phased import PhasedFeeder
+from gridsec.grid.phased import InPhases, PhasedFeeder
 from gridsec.grid.radial import Feeder
 from gridsec.grid.three_phase import ThreePhaseFeeder
 from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
