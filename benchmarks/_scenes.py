@@ -16,9 +16,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, depth_first_order, dijkstra
 
 from feeders.format.tables import CustomerRow, FeederMeta, FeederTables, LineRow
-from feeders.model.load_uncertainty import unread
-from feeders.model.site import Site, from_tables, load
-from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, design
+from feeders.model.site import Site, from_tables, load, unread
+from feeders.registry import SEQUENTIAL, DesignedEstimator, design
 from feeders.simulation.demand import Variation
 from feeders.simulation.scenario import START, Scenario
 from feeders.simulation.trial import FrameTruth, LoadError, Trial, TrialMeterErrors, frames

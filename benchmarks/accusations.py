@@ -347,14 +347,14 @@ def _volts(where: Site, estimate: Estimate, truth: FrameTruth) -> float:
 def _line(where: Site, frame: Frame, estimate: Estimate, verdict: Verdict, truth: FrameTruth) -> str:
     """One tick: seconds since the onset, decision, error in V and in std, names; honest ones with "!"."""
     ids, liars = where.meter_ids, truth.liars
-    who = [f"{'' if liars[j] else '!'}{ids[j]}" for j in np.flatnonzero(verdict.suspects)]
+    named = [f"{'' if liars[j] else '!'}{ids[j]}" for j in np.flatnonzero(verdict.suspects)]
     ratio = float((np.abs(estimate.v2 - truth.v2) / estimate.std).max())
     head = (
         f"{frame.t - T_ON:4.0f} s {verdict.decision:9} {_volts(where, estimate, truth):6.2f} V {ratio:5.1f}"
     )
     phases = f" busbar {np.flatnonzero(verdict.busbar).tolist()}" if verdict.busbar.any() else ""
     wrong = f" inverters {np.flatnonzero(verdict.inverters).tolist()}" if verdict.inverters.any() else ""
-    return f"{head}{phases}{wrong} named {' '.join(who) or '-'} | {verdict.reason}"
+    return f"{head}{phases}{wrong} named {' '.join(named) or '-'} | {verdict.reason}"
 
 
 def table(runs: list[Run]) -> str:

@@ -3,10 +3,10 @@
     python -m benchmarks.agreement [scenarios]
 
 Random minutes on the feeders that are small enough for the bank with M = 2 (CIGRE LV, SimBench rural 1,
-Kerber Landnetz): any time of the fourteen days, nobody, one or two liars by bias, scaling or a fake load of
-1 to 6 %. Compared are the meters named at the end, half a minute after the onset. Where they differ, the
-residual of the meter in question is put beside both limits: the bank's is a worst case, the monitor's a
-statistical one.
+Kerber Landnetz): any time of the fourteen days, no meter, one or two meters manipulated by bias, scaling or
+a fake load of 1 to 6 %. Compared are the meters named at the end, half a minute after the onset. Where they
+differ, the residual of the meter in question is put beside both limits: the bank's is a worst case, the
+monitor's a statistical one.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, load, to_frame
-from feeders.registry.registry import DIRECT, SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.registry import DIRECT, SEQUENTIAL, DesignedEstimator, choose, design
 from feeders.simulation.attacks import NoSuchAttack
 from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
 from gridsec.interface import Verdict
@@ -59,12 +59,12 @@ def scenario(site: Site, seed: int) -> Scenario:
 def compare(
     site: Site, watchers: tuple[DesignedEstimator, DesignedEstimator], seed: int
 ) -> tuple[list[Verdict], set[int]]:
-    """The last verdicts of both on the same readings, and who lied.
+    """The last verdicts of both on the same readings, and the manipulated meters.
 
     Parameters
     ----------
     site, watchers, seed
-        Where, who, and which.
+        Feeder, estimators, and number of the run.
     """
     what = scenario(site, seed)
     states = [watcher.init(START - 1.0) for watcher in watchers]
@@ -94,8 +94,10 @@ def main(count: int) -> int:
         if named[0] == named[1]:
             tally["the same meters" if named[0] == liars else "the same, liars below both limits"] += 1
             continue
-        more, less, verdict, who = (0, 1, bank, "the bank's") if named[0] > named[1] else (1, 0, ours, "ours")
-        tally[f"one more below {who} limit" if named[more] > named[less] else "other meters"] += 1
+        more, less, verdict, side = (
+            (0, 1, bank, "the bank's") if named[0] > named[1] else (1, 0, ours, "ours")
+        )
+        tally[f"one more below {side} limit" if named[more] > named[less] else "other meters"] += 1
         for j in sorted(named[more] - named[less]):
             print(
                 f"{FEEDERS[at]} {seed}: meter {j} {'lies' if j in liars else 'IS HONEST'}, named with "

@@ -25,8 +25,7 @@ from gridsec.arrays import Floats
 from gridsec.estimators import exact_bank
 from gridsec.estimators.exact_bank import bank as banks
 from gridsec.estimators.plant import Plant
-from gridsec.grid.droop import fleet
-from gridsec.grid.meter import MeterAccuracy
+from gridsec.grid.devices import MeterAccuracy, fleet
 from gridsec.grid.radial import Feeder
 from gridsec.interface import Frame
 from gridsec.observers.lure import Lure, close_loop, transition

@@ -1,4 +1,4 @@
-"""A busbar meter that lies: whether it is named, and nobody honest.
+"""A manipulated busbar meter: names of it, and of no honest meter.
 
     python -m benchmarks.busbar_lies [seeds]
 
@@ -26,7 +26,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import load
-from feeders.registry.registry import design
+from feeders.registry import design
 from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.trial import Trial, TrialMeterErrors, frames
 from gridsec.interface import Frame

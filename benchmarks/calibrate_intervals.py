@@ -1,4 +1,4 @@
-"""Whether the 95 % intervals of a calibration hold: recordings of feeders whose files are right.
+"""Coverage of the 95 % intervals of a calibration, on recordings of feeders with correct files.
 
     python -m benchmarks.calibrate_intervals [recordings] [feeder ...] [--days 4] [--step 900]
 
@@ -25,7 +25,7 @@ import numpy as np
 from benchmarks._arguments import count, positive
 from feeders.model.site import Site, load
 from feeders.simulation.demand import Variation
-from feeders.simulation.meters import Channel, MeterErrors, SimulatedMeters
+from feeders.simulation.plant import Channel, MeterErrors, SimulatedMeters
 from feeders.simulation.recording import record
 from feeders.simulation.scenario import Scenario
 from feeders.studies.calibrate.study import calibrate

@@ -29,7 +29,7 @@ from benchmarks._arguments import arguments
 from feeders.model.site import load
 from feeders.studies.campaign.plan import CampaignPlan
 from feeders.studies.campaign.study import Campaign, campaign
-from feeders.studies.workers import Dask, Processes, Runner
+from feeders.studies.running import Dask, Processes, Runner
 
 FEEDER, SCENES, FULL = "simbench-lv-rural3", 4, 10_000
 JOURNAL = Path("campaign-10000.journal")

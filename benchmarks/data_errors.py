@@ -30,11 +30,11 @@ import numpy as np
 
 from benchmarks._arguments import count
 from benchmarks.calibrate_exchanges import planted, truth_of
+from feeders import registry
 from feeders.format.tables import FeederTables
 from feeders.model.equipment import find
 from feeders.model.site import Site, Snapshot, from_tables, plant, to_frame
-from feeders.registry import registry
-from feeders.simulation.meters import Channel, MeterErrors
+from feeders.simulation.plant import Channel, MeterErrors
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.attack import Attack, Bias, Drift, Random, Replay, Scaling, Stuck
 from gridsec.estimators import data_errors

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from benchmarks._arguments import arguments
 from feeders.model.site import load
-from feeders.studies.droop.fleets import Who, equip, point
+from feeders.studies.droop.fleets import Equipped, equip, point
 from feeders.studies.droop.verdict import Subject, edge
 from gridsec.planning.droop.stability import Update, enlarged
 
@@ -30,7 +30,11 @@ def main(feeders: Sequence[str]) -> None:
     print("feeder, interval s, dead: proven, unstable, ratio")
     for name in feeders:
         site = load(name)
-        subject, fleet, at = Subject.of(site), equip(site, "ieee1547-b", Who.ALL), point(site, 0.3, 0.3, 1.05)
+        subject, fleet, at = (
+            Subject.of(site),
+            equip(site, "ieee1547-b", Equipped.ALL),
+            point(site, 0.3, 0.3, 1.05),
+        )
         for update in UPDATES:
             sure, over = edge(subject, fleet, update, at, enlarged)
             print(f"{name}, {update.interval_s:g}, {update.dead}: {sure:.3g}, {over:.3g}, {over / sure:.3g}")

@@ -1,15 +1,15 @@
-"""Colluding meters whose customer also reports the power of the load that they pretend.
+"""Colluding meters with a customer that also reports the power of the load that they pretend.
 
     python -m benchmarks.false_powers [seeds]
 
-Two meters show the trace of a load that is not there, at least 3 % deep, and the customer's own meter reports
-that load's power ("coordinated-power"). What is false fits together; only the honest neighbours contradict.
-The reverse: one meter reports the power of a load that is not there and would be 2 % deep, and all voltages
-are true ("power"); what is false is then told as somebody's power, never as an honest meter. As a control
-the same feeders and seeds with the trace alone, and with two independent lies of 3 %. Counted
-is, over the minute of the lie: exactly the liars named and nobody else; some of them named; none, but the
-liars are among the explanations given; nobody named and UNDECIDED for another reason; an honest meter named;
-CLEAN.
+Two meters show the trace of a load that is not there, at least 3 % deep, and the customer's own meter
+reports that load's power ("coordinated-power"). What is false fits together; only the honest neighbours
+contradict. The reverse: one meter reports the power of a load that is not there and would be 2 % deep, and
+all voltages are true ("power"); what is false is then told as a customer's power, never as an honest meter.
+As a control the same feeders and seeds with the trace alone, and with two independent lies of 3 %. Counted
+is, over the minute of the lie: exactly the manipulated meters named and no other; some of them named; none,
+but the liars are among the explanations given; no meter named and UNDECIDED for another reason; an honest
+meter named; CLEAN.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, load, to_frame
-from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.registry import SEQUENTIAL, DesignedEstimator, choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec, NoSuchAttack, manipulations
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 
@@ -47,7 +47,7 @@ def outcome(site: Site, watcher: DesignedEstimator, lie: AttackSpec, seed: int) 
     Parameters
     ----------
     site, watcher, lie, seed
-        Where, who watches, what is done, and which run.
+        Feeder, estimator, manipulation, and number of the run.
 
     Raises
     ------

@@ -15,9 +15,9 @@ from time import process_time
 import numpy as np
 
 from feeders.model.site import Site, load, to_frame
-from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.registry import SEQUENTIAL, DesignedEstimator, choose, design
 from feeders.simulation.attacks import NoSuchAttack
-from feeders.simulation.meters import MeterErrors
+from feeders.simulation.plant import MeterErrors
 from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
 from gridsec.attack import Attack, Replay
 from gridsec.estimators.sequential import attack_kind
@@ -59,7 +59,7 @@ def attacks(site: Site, kind: str, seed: int) -> tuple[tuple[Attack, ...], float
 
 
 def watch(site: Site, watcher: DesignedEstimator, scenario: Scenario) -> Seen:
-    """Play a scenario and remember what was said of whom."""
+    """Play a scenario and keep the kinds given to each meter."""
     liars = {int(j) for attack in scenario.attacks for j in attack.meters}
     on = min((attack.t_on for attack in scenario.attacks), default=START)
     state, seen = watcher.init(START), Seen()
@@ -122,14 +122,14 @@ def cost(name: str, ticks: int = 4200) -> str:
     watcher = design(choose(load(name), estimator=SEQUENTIAL))
     shapes, random = watcher.design.references, np.random.default_rng(0)
     p = shapes.limits.step.size
-    live, nobody, state, times = np.ones(p, np.bool_), np.zeros(p, np.bool_), attack_kind.empty(p), []
+    live, none, state, times = np.ones(p, np.bool_), np.zeros(p, np.bool_), attack_kind.no_kinds(p), []
     for k in range(ticks):
         v = 1.0 + 0.01 * np.sin(k / 500.0) + 5e-4 * random.standard_normal(p)
         y = (np.rint(v / shapes.limits.step) * shapes.limits.step) ** 2
         begin = process_time()
         heard = attack_kind.ingest(shapes, state, y, live)
         attack_kind.repeat_lags(heard)
-        state = attack_kind.classify(shapes, heard, y, y, nobody, y)
+        state = attack_kind.classify(shapes, heard, y, y, none, y)
         times.append(process_time() - begin)
     kept = state.history.blocks
     size = sum(b.code.nbytes + b.hash.nbytes + b.model.nbytes + b.own.nbytes for b in kept) / 1e6

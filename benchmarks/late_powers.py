@@ -37,7 +37,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import PowerAges, Site, Snapshot, from_tables, load, to_frame
-from feeders.registry.registry import DesignedEstimator, design
+from feeders.registry import DesignedEstimator, design
 from feeders.simulation.demand import Customers, Variation
 from feeders.simulation.powerflow import PowerFlow
 from feeders.simulation.scenario import START

@@ -44,7 +44,7 @@ import numpy as np
 from benchmarks._arguments import arguments
 from benchmarks._residuals import PATTERNS, KnownStep, present
 from feeders.model.site import Site, from_tables, load
-from feeders.registry.registry import DesignedEstimator, design
+from feeders.registry import DesignedEstimator, design
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, frames
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.estimators.modal import core, estimate, full, signatures, static

@@ -21,8 +21,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-from feeders.registry.design_cache import bank_gains
-from gridsec.grid.droop import fleet
+from feeders.registry import bank_gains
+from gridsec.grid.devices import fleet
 from gridsec.grid.radial import Feeder
 from gridsec.observers.gains import CircleOptions, margin, options_for
 from gridsec.observers.lmi import circle

@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import load
-from feeders.registry.registry import design
+from feeders.registry import design
 from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.scenario import START
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, frames
@@ -78,10 +78,10 @@ def play(feeder: str, size_kw: float, seed: int) -> Run:
         state, estimate, verdict = watcher.step(state, replace(frame, p=p))
         accused |= verdict.suspects & ~truth.liars
         if truth.liars.any():
-            off, who = np.abs(estimate.v2 - truth.v2), at[truth.liars]
+            off, manipulated = np.abs(estimate.v2 - truth.v2), at[truth.liars]
             undecided += verdict.decision is not Decision.ATTACKED
-            error.append(50.0 * off[who])
-            ratio.append(off[who] / estimate.std[who])
+            error.append(50.0 * off[manipulated])
+            ratio.append(off[manipulated] / estimate.std[manipulated])
     named = int((verdict.suspects & truth.liars).sum())
     return Run(count, named, int(accused.sum()), undecided, len(error), np.array(error), np.array(ratio))
 

@@ -17,9 +17,9 @@ import numpy as np
 
 from feeders.format.tables import FeederTables, LineRow
 from feeders.model.site import Site, from_tables, load
-from feeders.registry.registry import design
+from feeders.registry import design
 from feeders.simulation.attacks import AttackKind, AttackSpec
-from feeders.simulation.powerflow_three_phase import power_flow
+from feeders.simulation.powerflow import power_flow
 from feeders.simulation.trial import LoadError, Trial, judge
 from gridsec.arrays import Floats
 from gridsec.grid.meshed import Meshed
@@ -122,7 +122,7 @@ def sensitivity(site: Site, part: float) -> str:
 
 
 def named(site: Site, trick: AttackKind, percent: float) -> str:
-    """One row: liars, those missed, the slowest, the honest who were named, time of a step."""
+    """One row: liars, those missed, the slowest, honest meters named, time of a step."""
     kw, count = LOAD_KW[site.feeder.name], LIARS.get(site.feeder.name, site.meters.size // 3)
     outcomes = []
     for seed in SEEDS:
@@ -140,7 +140,7 @@ def named(site: Site, trick: AttackKind, percent: float) -> str:
 
 
 def clean(site: Site) -> str:
-    """One row: the honest who were named, and the seconds without an answer, where nobody lies."""
+    """One row without manipulation: honest meters named, and the seconds without an answer."""
     kw = LOAD_KW[site.feeder.name]
     trials = [Trial(site, seed, 30.0, load_error=LoadError(kw, kw / 3.0)) for seed in SEEDS]
     outcomes = [judge(design(trial.stated), trial, settling_s=3.0) for trial in trials]

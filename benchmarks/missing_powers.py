@@ -30,7 +30,7 @@ import numpy as np
 from benchmarks import _stealthy
 from benchmarks._arguments import arguments
 from benchmarks._scenes import Model, Setting, neighbours, play, site, start, without
-from feeders.model.load_uncertainty import unread
+from feeders.model.site import unread
 from feeders.simulation.scenario import START
 from gridsec.arrays import Bools, Ints
 from gridsec.estimators.sequential import step

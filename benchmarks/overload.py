@@ -39,7 +39,7 @@ import httpx
 from benchmarks._arguments import arguments
 from feeders.format.tables import write
 from feeders.model.site import Site, load
-from feeders.simulation.meters import BUSBAR
+from feeders.simulation.plant import BUSBAR
 from feeders.simulation.scenario import Scenario, simulate
 from service.cli.simulate import key_of
 from service.ingest.queues import BusConfig

@@ -1,4 +1,4 @@
-"""Partial observers on feeders: what single meters know, what the paper's constants promise, who is named.
+"""Partial observers on feeders: what single meters know, what the paper's constants promise, named meters.
 
 Two feeders, AC power flow, one reading a second for 60 s; from 30 s on one meter at random is off. The exact
 bank sees the same readings. Exits 1 if an honest meter is named.
@@ -19,8 +19,8 @@ from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.errors import NotObservable
 from gridsec.estimators import exact_bank, partial
 from gridsec.estimators import partial as partial_observers
-from gridsec.estimators.inputs import PreviousStep, clean
 from gridsec.estimators.partial import CodeWord, Parts
+from gridsec.estimators.plant import PreviousStep, clean
 from gridsec.interface import Frame
 from gridsec.secure.decode import cospark
 from gridsec.secure.decode.noise import correction_constants
@@ -94,14 +94,14 @@ def knowledge(site: Site, made: partial.PartialDesign) -> None:
 def named(
     step: Callable[..., Any], made: Any, state: Any, seen: list[Frame]
 ) -> tuple[np.ndarray, Any, float]:
-    """Who is named at every tick, the last answers, and the median time of a step, ms."""
-    who, spent = [], []
+    """Named meters at every tick, the last answers, and the median time of a step, ms."""
+    suspects, spent = [], []
     for frame in seen:
         begun = time.perf_counter()
         state, estimate, verdict = step(made, state, frame)
         spent.append(time.perf_counter() - begun)
-        who.append(verdict.suspects)
-    return np.array(who), (estimate, verdict), 1e3 * float(np.median(spent))
+        suspects.append(verdict.suspects)
+    return np.array(suspects), (estimate, verdict), 1e3 * float(np.median(spent))
 
 
 def main() -> int:
@@ -124,9 +124,13 @@ def main() -> int:
             ):
                 hits, false, top, bound, spent = 0, 0, [], [], []
                 for liar, seen in runs:
-                    who, (estimate, verdict), ms = named(module.step, made, module.init(made, START), seen)
-                    hits += bool(liar >= 0 and who[-1, liar])
-                    false += int(np.delete(who, liar, axis=1).any()) if liar >= 0 else int(who.any())
+                    suspects, (estimate, verdict), ms = named(
+                        module.step, made, module.init(made, START), seen
+                    )
+                    hits += bool(liar >= 0 and suspects[-1, liar])
+                    false += (
+                        int(np.delete(suspects, liar, axis=1).any()) if liar >= 0 else int(suspects.any())
+                    )
                     top.append(float(np.median(verdict.threshold)))
                     bound.append(float(estimate.bound.max()))
                     spent.append(ms)

@@ -4,7 +4,7 @@
 
 So many lies that are to stay hidden, of two meters in the worst collusion or of one alone, and as many
 whose liars are to be named: 10 000 of each by default, on all cores. A scene has three scenarios of 18 s; the
-first is without a lie, and the others, 12 s of a lie each, are compared with it. Exits 1 if somebody is named
+first is without a lie, and the others, 12 s of a lie each, are compared with it. Exits 1 if a meter is named
 because of one of the former, or one of the latter is missed. With a journal an interrupted run goes on. The
 feeder is SimBench rural 1, 13 customers, unless another is asked for.
 """
@@ -28,7 +28,7 @@ from feeders.studies.campaign.guarantees import promised
 from feeders.studies.campaign.plan import CampaignPlan, Place
 from feeders.studies.campaign.study import campaign
 from feeders.studies.detectable import detectable
-from feeders.studies.workers import Here, Processes
+from feeders.studies.running import Here, Processes
 
 FEEDER, LIES, LIARS = "simbench-lv-rural1", 10_000, 2
 PLAN = CampaignPlan(
@@ -73,7 +73,7 @@ def main(lies: int, feeder: str, journal: Path | None) -> int:
     # By the clock without the start of the processes: from the first scene that was done here to the last.
     (begun, first), (ended, last) = done[min(1, len(done) - 1)], done[-1]
     each = (ended - begun) / max(last - first, 1)
-    used = [getrusage(who) for who in (RUSAGE_SELF, RUSAGE_CHILDREN)]
+    used = [getrusage(part) for part in (RUSAGE_SELF, RUSAGE_CHILDREN)]
     cost = sum(one.ru_utime + one.ru_stime for one in used) / max(last - done[0][1], 1) / cores
     print(
         f"{cores} processes, {each:.3f} s per scene; {LIES} lies of each: {each * LIES / 60.0:.0f} min by "

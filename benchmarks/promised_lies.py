@@ -3,7 +3,7 @@
     python -m benchmarks.promised_lies [trials] [feeder ...]
 
 10 000 lies up to the hidden size, in the worst collusion of two meters, and 10 000 from the named size on,
-half of them with another liar. Exits 1 if somebody is named for one of the former, or one of the latter is
+half of them with another liar. Exits 1 if a meter is named for one of the former, or one of the latter is
 missed. Figures are printed every 1 000 trials.
 """
 

@@ -36,8 +36,7 @@ from gridsec.arrays import Floats
 from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt
-from gridsec.grid.droop import fleet
-from gridsec.grid.meter import MeterAccuracy
+from gridsec.grid.devices import MeterAccuracy, fleet
 from gridsec.grid.radial import Feeder
 from gridsec.interface import Frame
 
@@ -113,7 +112,7 @@ class Measured:
     Attributes
     ----------
     steady
-        Median of the steps in which nobody lies.
+        Median of the steps without manipulation.
     median, mean
         Of the steps of an attack.
     search, largest

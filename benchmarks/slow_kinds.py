@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, Snapshot, from_tables, load, to_frame
-from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.registry import SEQUENTIAL, DesignedEstimator, choose, design
 from feeders.simulation.scenario import Scenario, simulate, snapshots
 from gridsec.arrays import Floats, Ints
 

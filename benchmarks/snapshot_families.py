@@ -1,4 +1,4 @@
-"""Where the decoders of single ticks stop telling who lies.
+"""Limits of the decoders of single ticks.
 
 AC power flow, one reading a second for 30 s; from 10 s on k of 13 meters at random lie: each in its own
 direction (bias), all in the same (together), or like a load that is not there (coordinated). Every decoder
@@ -22,7 +22,7 @@ from itertools import product
 import numpy as np
 
 from feeders.model.site import load
-from feeders.registry.registry import DesignedEstimator, choose, design
+from feeders.registry import DesignedEstimator, choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, TrialResult, frames, judge
 from gridsec.estimators.sequential import SequentialDesign
@@ -51,7 +51,7 @@ class Scene:
         )
 
     def lies(self, count: int) -> Iterator[AttackSpec | None]:
-        """Nobody, then all lies of so many meters."""
+        """No manipulation, then all manipulations of each number of meters."""
         yield None
         for trick, size in product(TRICKS[: None if count > 1 else 1], self.sizes):
             yield AttackSpec(trick, count, size, ONSET_S)

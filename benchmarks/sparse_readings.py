@@ -2,20 +2,20 @@
 
     python -m benchmarks.sparse_readings [seeds] [feeder]
 
-Kerber Vorstadtnetz with 146 customers unless another feeder is asked for, loads of customers who are read
-known within 0.6 kW and 0.2 kvar (600 s), meters with white noise of 0.2 %. A third of the meters that report
-at all lies by 3 % with random signs. Intervals of 1 s, 60 s and 900 s from a sunny noon on; all meters, half
-of them (chosen at random, silent from the start), or every meter at random moments of its own, on average at
-every second tick. Who is not read tells no powers either: they are what `feeders.model.site.to_frame` makes
-of a reading that is not there, the range of what the customer can draw and feed in, or the forecast from the
-library's profiles. Customers follow the very profiles whose means over the season are their forecasts, as the
-files have them.
+Kerber Vorstadtnetz with 146 customers unless another feeder is asked for, loads of customers that are read
+known within 0.6 kW and 0.2 kvar (600 s), meters with white noise of 0.2 %. A third of the meters that
+report at all lies by 3 % with random signs. Intervals of 1 s, 60 s and 900 s from a sunny noon on; all
+meters, half of them (chosen at random, silent from the start), or every meter at random moments of its own,
+on average at every second tick. A customer that is not read tells no powers either: they are what
+`feeders.model.site.to_frame` makes of a reading that is not there, the range of what the customer can draw
+and feed in, or the forecast from the library's profiles. Customers follow the very profiles whose means
+over the season are their forecasts, as the files have them.
 
-Counted are those named within the limit, of those who lie, in readings of the meter's own; those never named;
-honest meters ever named; the median delay; the 95th percentile of the error of the reconstructed voltage at
-lying meters and at those that are not read at that tick, in % of nominal, of the worst seed; the 95th
-percentile of the latter in the standard deviations given with it; and the median processor time of a step
-in the last ten ticks before anybody lies.
+Counted are those named within the limit, of the manipulated meters, in readings of the meter's own; those
+never named; honest meters ever named; the median delay; the 95th percentile of the error of the
+reconstructed voltage at lying meters and at those that are not read at that tick, in % of nominal, of the
+worst seed; the 95th percentile of the latter in the standard deviations given with it; and the median
+processor time of a step in the last ten ticks before the manipulation.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, from_tables, load
-from feeders.registry.registry import design
-from feeders.simulation.meters import Channel, MeterOutage
+from feeders.registry import design
+from feeders.simulation.plant import Channel, MeterOutage
 from feeders.simulation.scenario import START
 from feeders.simulation.trial import FrameTruth, Trial, frames
 from gridsec.arrays import Bools
@@ -50,7 +50,7 @@ BEFORE, AFTER, LIMIT, SIZE = 40, 60, 8, 0.03
 
 
 def watched(feeder: str, forecast: str) -> Site:
-    """The feeder, with forecasts of powers that nobody reads or without."""
+    """The feeder, with forecasts of unread powers or without."""
     tables = load(feeder).tables
     meta = replace(tables.meta, load=replace(tables.meta.load, forecast=forecast))
     return from_tables(replace(tables, meta=meta))
@@ -74,7 +74,7 @@ def channel(site: Site, there: Bools, step_s: float) -> Channel:
 
 
 def played(trial: Trial, pattern: str) -> Iterator[tuple[Frame, FrameTruth, Bools]]:
-    """Frames of what is heard, the truth, and who lies."""
+    """Frames of what is heard, the truth, and the manipulated meters."""
     rng = np.random.default_rng([3, trial.seed])
     count = trial.site.meters.size
     there = heard(pattern, count, rng)

@@ -4,7 +4,7 @@
 
 Voltages of LinDist3Flow, plain and with one correction, and of the single-phase equivalent (every customer
 spread over three phases, losses corrected), at multiples of the load of the feeder's fullest minute and with
-1 kW for everybody, behind a stiff busbar and behind the feeder's transformer. Then sensitivities against
+1 kW for every customer, behind a stiff busbar and behind the feeder's transformer. Then sensitivities against
 differences of the power flow, and the certificates of a fleet of inverters. Limits: corrected voltages
 within 0.1 %, sensitivities at the operating point within 2 %, at the load of that minute.
 """
@@ -25,10 +25,10 @@ import numpy as np
 
 from feeders.model.site import from_tables
 from feeders.model.three_phase import ThreePhaseSite, load_three_phase
-from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow, sequence_ohm
+from feeders.simulation.powerflow import UnbalancedPowerFlow, sequence_ohm
 from gridsec.arrays import Floats, Phasors, spectral_radius
 from gridsec.errors import DesignInfeasible
-from gridsec.grid.droop import fleet
+from gridsec.grid.devices import fleet
 from gridsec.grid.three_phase import bus_voltages, lindist3flow, model_error_bound, sensitivities
 from gridsec.observers.certificates import reactance, small_gain
 from gridsec.observers.lure import close_loop
@@ -56,7 +56,7 @@ class Case:
         feeder, base = self.feeder, self.feeder.base_kva
         _, buses = self.truth.solve(p_kw, q_kvar, BUSBAR_PU * self.volt)
         truth = buses / self.volt
-        measured = truth[0] ** 2  # magnitudes alone: nobody meters the angles
+        measured = truth[0] ** 2  # magnitudes alone: no meter measures the angles
         p, q = -3.0 * p_kw / base, -3.0 * q_kvar / base
         plain, once = (np.sqrt(bus_voltages(feeder, p, q, measured, steps=n)).T for n in (0, 1))
         bound = model_error_bound(feeder, p, q, measured) / (2.0 * np.sqrt(measured.min()))

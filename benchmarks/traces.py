@@ -5,7 +5,8 @@
 Trips: ticks of 14 samples from zenoh to an alarm in REST; a calm frame and a frame that names two meters in
 the default monitor; a feeder's folder to a `Site`, and that to a design; `gridsec study campaign` with four
 scenarios. Columns: files of the three packages that are entered, functions, and calls into another file than
-the last call of the same thread. Modules that are only imported do not count.
+the last call of the same thread. Only functions called at run time count: not bodies of modules and classes,
+nor calls made while a module is imported.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from inspect import CO_OPTIMIZED
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
@@ -35,7 +37,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Snapshot, load, to_frame
-from feeders.registry.registry import design
+from feeders.registry import design
 from feeders.simulation.scenario import Scenario, random_attacks, simulate
 from service.app import Running, serve
 from service.cli.main import main as gridsec
@@ -63,17 +65,21 @@ class Trip:
     changes: int = 0
     on: bool = False
     last: dict[int, str] = field(default_factory=dict)
+    imports: Counter[int] = field(default_factory=Counter)  # modules being imported, by thread
 
     def __call__(self, frame: FrameType, event: str, _: Any) -> None:
         """Count one call; the signature is that of `sys.setprofile`."""
-        if not self.on or event != "call" or not frame.f_code.co_filename.startswith(PACKAGES):
+        code, thread = frame.f_code, threading.get_ident()
+        if code.co_name == "<module>" and event in ("call", "return"):
+            self.imports[thread] += 1 if event == "call" else -1
+        if not self.on or event != "call" or not code.co_filename.startswith(PACKAGES):
             return
-        name, thread = frame.f_code.co_filename, threading.get_ident()
-        # Bodies of modules and classes are imports.
-        if frame.f_code.co_name == "<module>":
+        # Bodies of modules and classes are not optimised code; calls below a module body are its import.
+        if not code.co_flags & CO_OPTIMIZED or self.imports[thread] > 0:
             return
+        name = code.co_filename
         self.files[name] += 1
-        self.functions.add(frame.f_code)
+        self.functions.add(code)
         self.changes += self.last.get(thread, name) != name
         self.last[thread] = name
 

@@ -28,7 +28,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, from_tables, load
-from feeders.registry.registry import DesignedEstimator, design
+from feeders.registry import DesignedEstimator, design
 from feeders.simulation.scenario import START
 from feeders.simulation.trial import (
     AttackKind,

@@ -1,4 +1,4 @@
-"""Unknown inputs on real feeders: who is named when a meter lies and an inverter injects what it should not.
+"""Unknown inputs on real feeders: named devices under a manipulated meter and an inverter off its curve.
 
 AC power flow, meters of class 0.5 with 0.1 V steps and 0.05 % jitter, loads known to the feeder's own limits,
 1 reading per second, `max_attacked = 1`. From 15 s to 40 s a random meter is off by `--lie` and a random
@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from feeders.model.site import Site, load, to_frame
-from feeders.registry.registry import DesignedEstimator, choose, design
-from feeders.simulation.meters import MeterErrors
+from feeders.registry import DesignedEstimator, choose, design
+from feeders.simulation.plant import MeterErrors
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.attack import Bias, InverterAttack
 from gridsec.interface import Decision, Verdict

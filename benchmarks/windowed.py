@@ -35,7 +35,7 @@ def run(size: float, seed: int) -> tuple[int, list[Frame]]:
 
 
 def watch(made: windowed.WindowedDesign, frames: list[Frame]) -> Iterator[np.ndarray]:
-    """Who is named at every tick."""
+    """Named meters at every tick."""
     state = windowed.init(made, frames[0].t)
     for frame in frames:
         state, _, verdict = windowed.step(made, state, frame)

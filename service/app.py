@@ -16,7 +16,7 @@ import structlog
 
 from feeders.format.tables import from_json
 from feeders.model.site import Site, from_tables, load
-from feeders.registry.registry import choose
+from feeders.registry import choose
 from gridsec.errors import FeederInvalid, GridsecError, Problem
 from service import systemd
 from service.access.tokens import TokenVerifier

@@ -5,10 +5,12 @@ from __future__ import annotations
 import importlib
 import re
 import runpy
+import sys
 from pathlib import Path
 
 import pytest
 
+from benchmarks import traces
 from benchmarks._arguments import arguments
 
 ROOT = Path(__file__).parents[1]
@@ -58,3 +60,29 @@ def test_arguments_of_benchmarks_are_looked_at(monkeypatch: pytest.MonkeyPatch) 
         monkeypatch.setattr("sys.argv", ["x", *wrong])
         with pytest.raises(SystemExit):
             arguments("", **usual)
+
+
+def test_a_trace_counts_functions_at_run_time_and_nothing_of_an_import(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "traced_low.py").write_text(
+        "class Low:\n    x = 1\n\n\ndef at_import():\n    pass\n\n\ndef run():\n    pass\n"
+    )
+    (tmp_path / "traced_top.py").write_text(
+        "import traced_low\n\ntraced_low.at_import()\n\n\ndef run():\n    class Inner:\n        pass\n\n"
+        "    traced_low.run()\n    [traced_low.run() for _ in range(2)]\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(traces, "PACKAGES", (str(tmp_path),))
+
+    def trip(module: str) -> traces.Trip:
+        return traces.of(lambda: importlib.import_module(module).run())
+
+    first, again = trip("traced_top"), trip("traced_top")
+    for module in ("traced_top", "traced_low"):
+        sys.modules.pop(module)
+    names = {code.co_name for code in first.functions} - {"<listcomp>"}
+    assert names == {"run"}
+    assert {Path(file).stem for file in first.files} == {"traced_top", "traced_low"}
+    assert (first.files, first.changes) == (again.files, again.changes)
+    assert first.files[str(tmp_path / "traced_low.py")] == 3

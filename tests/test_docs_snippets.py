@@ -22,7 +22,7 @@ import pytest
 
 from benchmarks.mesh import european, landnetz
 from feeders.model.site import Site, load
-from feeders.registry.registry import DesignedEstimator, DesignOptions, Estimator
+from feeders.registry import DesignedEstimator, DesignOptions, Estimator
 from feeders.simulation import trial as trials
 from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.trial import Trial, TrialMeterErrors

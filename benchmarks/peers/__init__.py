@@ -1,4 +1,4 @@
-"""Side by side with open tools: who finds manipulated voltage meters in one snapshot, and how fast.
+"""Comparison with open tools: manipulated voltage meters found in one snapshot, and the time taken.
 
 Everything runs on one thread, whatever the environment asks for: set here, before NumPy is loaded, and
 handed on to every process that is started from here.

@@ -1,4 +1,4 @@
-"""Who finds manipulated meters, side by side: `python -m benchmarks.peers [--trials N] [--write docs]`.
+"""Comparison with open tools: `python -m benchmarks.peers [--trials N] [--write docs]`.
 
 Without `--write` a short run that prints its tables. With it, docs/peers.md and its figures are written.
 """
@@ -20,7 +20,7 @@ FEEDERS = ("rural1-behind", "rural3-behind")
 def main() -> int:
     """Measure, print, and write if asked for.
 
-    Exits 1 if ours names somebody too often in any clean cell, or if a peer is exact more often in any other
+    Exits 1 if ours names a meter too often in any clean cell, or if a peer is exact more often in any other
     one; in both beyond what may be chance.
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks.peers", description=__doc__)
@@ -56,16 +56,16 @@ def _run(wanted: argparse.Namespace) -> tuple[report.Scores, report.Scores]:
     single: report.Scores = {}
     minute: report.Scores = {}
     for feeder in wanted.feeders:
-        here, everybody = prepared(feeder)
+        here, every = prepared(feeder)
         voter = Greedy(here, 3.5)
         for cell in cells((feeder,)):
             clean = cell.attack == "clean"
             trials = wanted.clean if clean else wanted.trials
-            single[cell] = measure(cell, here, everybody, trials=trials, panda=min(trials, wanted.panda))
+            single[cell] = measure(cell, here, every, trials=trials, panda=min(trials, wanted.panda))
             print(report.line(cell, single[cell]), flush=True)
             if wanted.minute:
                 few = min(wanted.minute, wanted.panda)
-                minute[cell] = measure(cell, here, everybody, trials=wanted.minute, panda=few, seconds=60)
+                minute[cell] = measure(cell, here, every, trials=wanted.minute, panda=few, seconds=60)
                 minute[cell]["pgm votes"] = votes(cell, here, voter, trials=wanted.minute, seconds=60)
                 minute[cell][SERVED] = watched(cell, here, trials=wanted.minute, seconds=60)
                 print("60 s", report.line(cell, minute[cell]), flush=True)

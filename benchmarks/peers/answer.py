@@ -11,12 +11,12 @@ from gridsec.arrays import Bools, Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """Who is named. N customers.
+    """Named meters. N customers.
 
     Attributes
     ----------
     named : (N,)
-        Whose voltage meter is manipulated.
+        Customers with a manipulated voltage meter.
     others
         Other explanations with their likelihood, the best first; `named` has the rest of it.
     v : (N,)

@@ -24,8 +24,7 @@ from benchmarks.peers.answer import Answer
 from benchmarks.peers.scene import Reading, Scene
 from feeders.simulation import powerflow
 from gridsec.arrays import Bools, Floats
-from gridsec.estimators.sequential.load_uncertainty import LoadDoubt, prior
-from gridsec.estimators.sequential.posterior import condition, remove_meter
+from gridsec.estimators.sequential.posterior import LoadDoubt, condition, remove_meter, voltage_prior
 
 _SQRT3 = np.sqrt(3.0)
 
@@ -151,7 +150,7 @@ class GreedyChi:
         self.grid.tell(told)
         v = told.v
         noise = (2.0 * v * told.std_v) ** 2
-        known = prior(
+        known = voltage_prior(
             self.feeder,
             self.feeder.bus,
             LoadDoubt(told.std_p, told.std_q, 1.0),

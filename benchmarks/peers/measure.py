@@ -18,7 +18,7 @@ from benchmarks.peers.scene import ATTACKS, Cell, Scene, Snapshot, mean, reading
 
 NOISES = ((0.001, 0.1), (0.005, 0.3))
 OURS, SERVED, PANDA = "ours", "served", "pandapower"
-# Of clean snapshots, at most this part may name somebody.
+# Of clean snapshots, at most this part may name a meter.
 FALSE = 0.01
 _CONFIDENCE = 0.95
 # No parameter of any method was chosen on these random numbers.
@@ -34,7 +34,7 @@ class Score:
     ----------
     trials, exact, missed, false, failed
         Snapshots; those where the named meters are exactly the liars; where a liar was not named; where
-        somebody else was; where the method had no result.
+        another meter was; where the method had no result.
     among
         Those where the liars are exactly one of the explanations.
     ms
@@ -67,7 +67,7 @@ def cells(feeders: tuple[str, ...]) -> Iterator[Cell]:
 
 
 def methods(here: Scene) -> dict[str, Method]:
-    """Everybody, prepared for a feeder."""
+    """All methods, prepared for a feeder."""
     return {
         PANDA: Panda(here),
         "pgm 3.0": Greedy(here, 3.0),
@@ -78,20 +78,20 @@ def methods(here: Scene) -> dict[str, Method]:
 
 
 def measure(
-    cell: Cell, here: Scene, everybody: dict[str, Method], *, trials: int, panda: int, seconds: int = 1
+    cell: Cell, here: Scene, every: dict[str, Method], *, trials: int, panda: int, seconds: int = 1
 ) -> dict[str, Score]:
     """One cell: every method sees the same snapshots, one after the other.
 
-    With `seconds`, everybody gets the mean of the readings, with its smaller standard deviation.
+    With `seconds`, every method gets the mean of the readings, with its smaller standard deviation.
     """
-    scores = {name: Score() for name in everybody}
+    scores = {name: Score() for name in every}
     if PANDA in scores:
         scores[PANDA].seen = 0
-    times: dict[str, list[float]] = {name: [] for name in everybody}
+    times: dict[str, list[float]] = {name: [] for name in every}
     for trial in range(trials):
         told = snapshot(here, cell, np.random.default_rng([_SEED, trial, cell.liars]), seconds)
         given = mean(told)
-        for name, method in everybody.items():
+        for name, method in every.items():
             if name == PANDA and trial >= panda:
                 continue
             start = time.perf_counter()
@@ -106,7 +106,7 @@ def measure(
 
 
 def votes(cell: Cell, here: Scene, method: Method, *, trials: int, seconds: int) -> Score:
-    """Another way to use time: judge every second alone; who is named in most of them is named."""
+    """Another way to use time: judge every second alone; a meter named in most of them is named."""
     score, times = Score(), []
     for trial in range(trials):
         told = snapshot(here, cell, np.random.default_rng([_SEED, trial, cell.liars]), seconds)
@@ -156,7 +156,7 @@ def beaten(scores: dict[Cell, dict[str, Score]]) -> list[Cell]:
 
 
 def too_many(scores: dict[Cell, dict[str, Score]]) -> list[Cell]:
-    """Clean cells in which ours names somebody in more snapshots than allowed, and not by chance."""
+    """Clean cells in which ours names a meter in more snapshots than allowed, and not by chance."""
     clean = ((cell, here[OURS]) for cell, here in scores.items() if cell.attack == "clean" and OURS in here)
     return [cell for cell, ours in clean if limits(ours.false, ours.trials)[0] > FALSE]
 
@@ -175,8 +175,8 @@ def _count(score: Score, answer: Answer, told: Snapshot) -> None:
 def prepared(feeder: str) -> tuple[Scene, dict[str, Method]]:
     """A feeder with all methods, each run once on a clean snapshot, so that caches are warm."""
     here = scene(feeder)
-    everybody = methods(here)
+    every = methods(here)
     told = snapshot(here, Cell(feeder, *NOISES[0]), np.random.default_rng(0))
-    for method in everybody.values():
+    for method in every.values():
         method(mean(told))
-    return here, everybody
+    return here, every

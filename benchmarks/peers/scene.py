@@ -29,13 +29,13 @@ SIZE = 0.03
 ATTACKS = ("bias", "coord", "coord+pq")
 FEEDERS = {"rural1": "simbench-lv-rural1", "rural3": "simbench-lv-rural3"}
 POWER_FACTOR_TAN = 0.33
-# Nobody's powers are known better than this part of the feeder's mean connected load.
+# No power is known better than this part of the feeder's mean connected load.
 FLOOR = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One cell of the table: a feeder, what its readings are worth, and who lies.
+    """One cell of the table: a feeder, the quality of its readings, and the manipulated meters.
 
     Attributes
     ----------
@@ -95,7 +95,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
-    """What everybody is told, and what is true. T readings each, N customers.
+    """Readings of all methods, and the truth. T readings each, N customers.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class Snapshot:
     std_p, std_q : (N,)
         Standard deviations of `p` and `q`, pu.
     liars : (N,)
-        Whose voltage reading is manipulated.
+        Customers with a manipulated voltage reading.
     true_v : (N,)
         The voltages, pu.
     """
@@ -233,7 +233,7 @@ def _voltages(here: Scene, p: Floats, q: Floats, v0: float) -> Floats:
 def _attacked(
     here: Scene, cell: Cell, rng: np.random.Generator, truth: tuple[Floats, Floats, float, Floats]
 ) -> tuple[Floats, Floats, Floats, Bools]:
-    """What is reported before noise: voltages, powers, and who lies."""
+    """Reports before noise: voltages, powers, and manipulated meters."""
     p, q, _, v = truth
     liars = np.zeros(v.size, dtype=np.bool_)
     if cell.attack == "clean":

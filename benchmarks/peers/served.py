@@ -13,8 +13,7 @@ from benchmarks.peers.scene import Scene, Snapshot
 from gridsec.arrays import Bools
 from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
-from gridsec.grid.droop import Droop
-from gridsec.grid.meter import MeterAccuracy
+from gridsec.grid.devices import Droop, MeterAccuracy
 from gridsec.interface import Decision, Frame
 
 # The powers' error is the same in all readings: it lasts much longer than they do.

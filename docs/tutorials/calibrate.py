@@ -14,7 +14,7 @@ from pathlib import Path
 from feeders.format.tables import read, write
 from feeders.model.site import from_tables, load
 from feeders.simulation.demand import Variation
-from feeders.simulation.meters import MeterErrors
+from feeders.simulation.plant import MeterErrors
 from feeders.simulation.recording import record
 from feeders.simulation.scenario import Scenario
 from feeders.studies.calibrate.study import calibrate

@@ -12,16 +12,16 @@ from pathlib import Path
 import pandas as pd
 
 from feeders.model.site import load
-from feeders.simulation.trial import LoadError, Meters
-from feeders.studies.comparison import Plan, compare, markdown, write_csv
+from feeders.simulation.trial import LoadError, TrialMeterErrors
+from feeders.studies.comparison import ComparisonPlan, compare, markdown, write_csv
 
 site = load("cigre-lv")
-plan = Plan(
+plan = ComparisonPlan(
     max_attacked=2,
     seeds=2,  # a real comparison has dozens, of eight minutes each
     duration_s=75.0,
     load_error=LoadError(p_kw=0.1, q_kvar=0.05),
-    meters=Meters.SITE,  # a fixed error within the class of each, rounding and jitter
+    meters=TrialMeterErrors.SITE,  # a fixed error within the class of each, rounding and jitter
     families=("sequential", "exact-bank", "weighted-least-squares"),
     cases=("clean", "bias", "coordinated"),
 )

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from feeders.format.tables import write
-from feeders.model.load_uncertainty import forecast_errors, from_history, load_doubt, tell
-from feeders.model.site import from_tables, load
+from feeders.model.site import forecast_errors, from_history, from_tables, load, load_doubt, tell
 from feeders.simulation.demand import Customers, Variation
 from feeders.simulation.scenario import START
 

@@ -41,7 +41,7 @@ from feeders.convert.provenance import (
 from feeders.convert.round_trip import SourceCheck, compare
 from feeders.convert.source import SourceNetwork
 from feeders.convert.transformers import EVERYTHING, Extent
-from feeders.format.reader import CUSTOMERS_FILE, LINES_FILE, META_FILE
+from feeders.format.columns import CUSTOMERS_FILE, LINES_FILE, META_FILE
 from feeders.format.tables import FeederTables, read, write
 from feeders.model.site import from_tables
 from feeders.profiles import ENVELOPES, Season

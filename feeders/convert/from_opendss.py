@@ -23,7 +23,7 @@ from feeders.convert.customers import Draw, as_it_stands, is_even, rounded
 from feeders.convert.lines import Coupling, line_row, with_taps
 from feeders.convert.provenance import Changes, ConversionChange, SourceUnreadable
 from feeders.convert.source import CONSTANT, IN_STAR, MEASURE, OFF, UNLIKE, SourceNetwork
-from feeders.format.reader import CheckReport
+from feeders.format.columns import CheckReport
 from feeders.format.tables import LineRow
 from feeders.util import extra
 from gridsec.arrays import Floats, Phasors

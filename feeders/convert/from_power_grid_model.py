@@ -25,7 +25,7 @@ from feeders.convert.lines import ALL, Coupling, by_sequence, charging_cells, li
 from feeders.convert.provenance import Changes, SourceUnreadable
 from feeders.convert.source import CONSTANT, MEASURE, OFF, UNLIKE, SourceNetwork
 from feeders.convert.transformers import TwoPort, coupling_of
-from feeders.format.reader import some
+from feeders.format.columns import some
 from feeders.format.tables import LineRow
 from feeders.format.validation import same_level
 from gridsec.arrays import Floats, Phasors

@@ -13,7 +13,7 @@ import numpy as np
 from feeders.convert.customers import Draw, rounded
 from feeders.convert.provenance import WHOLE, Changes, ConversionChange
 from feeders.format.columns import SERIES_NAMES, SHUNT_NAMES, LineRow
-from feeders.format.matrices import cells_of, columns_of, passive, shunt_us
+from feeders.format.validation import cells_of, columns_of, passive, shunt_us
 from feeders.model.three_phase import series_of, shunt_of
 from gridsec.arrays import Floats, Ints, Phasors
 

@@ -42,7 +42,7 @@ from feeders.format.tables import FeederMeta, FeederTables, LineRow, LoadDefault
 from feeders.format.validation import loops
 from gridsec.arrays import Phasors
 from gridsec.errors import FeederInvalid, GridsecError, Problem
-from gridsec.grid.droop import preset
+from gridsec.grid.devices import preset
 from gridsec.grid.three_phase import ROTATION
 
 TURNED: Final = 1.0

@@ -16,8 +16,7 @@ import numpy as np
 from feeders.format.tables import FeederTables
 from feeders.model.site import from_tables
 from feeders.model.three_phase import spanned
-from feeders.simulation.powerflow import PowerFlow
-from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow
+from feeders.simulation.powerflow import PowerFlow, UnbalancedPowerFlow
 from gridsec.arrays import Floats, Phasors
 from gridsec.errors import GridsecError
 

@@ -15,15 +15,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from feeders.format import reader, validation
+from feeders.format import validation
 from feeders.format.columns import (
     CUSTOMER_COLUMNS,
+    CUSTOMERS_FILE,
     LINE_COLUMNS,
+    LINES_FILE,
     META_COLUMNS,
+    META_FILE,
     PHASE_NAMES,
     REQUIRED,
     SECTIONS,
     CellInvalid,
+    CheckReport,
     Column,
     CustomerRow,
     FeederMeta,
@@ -33,17 +37,13 @@ from feeders.format.columns import (
     LoadDefaults,
     MeterDefaults,
     MonitorDefaults,
-    shown,
-)
-from feeders.format.reader import (
-    CUSTOMERS_FILE,
-    LINES_FILE,
-    META_FILE,
-    CheckReport,
     Parsed,
     ParsedRow,
     RawTables,
     Rows,
+    from_folder,
+    from_object,
+    shown,
 )
 from feeders.util import plain
 from gridsec.errors import FeederInvalid, Problem
@@ -99,8 +99,8 @@ def validate(source: FeederTables | Path | str | Mapping[str, Any]) -> tuple[Pro
 def examine(source: FeederTables | Path | str | Mapping[str, Any]) -> Examination:
     """Read and check a feeder; invalid content never raises."""
     if isinstance(source, (Path, str)):
-        return _examine(reader.from_folder(Path(source)))
-    return _examine(reader.from_object(to_json(source) if isinstance(source, FeederTables) else source))
+        return _examine(from_folder(Path(source)))
+    return _examine(from_object(to_json(source) if isinstance(source, FeederTables) else source))
 
 
 def read(path: Path | str) -> FeederTables:
@@ -110,7 +110,7 @@ def read(path: Path | str) -> FeederTables:
 
 def from_json(obj: object) -> FeederTables:
     """Read a feeder from its decoded JSON form; `FeederInvalid` has every problem, of any object."""
-    return _tables(_examine(reader.from_object(obj)))
+    return _tables(_examine(from_object(obj)))
 
 
 def to_json(tables: FeederTables) -> dict[str, Any]:

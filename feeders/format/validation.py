@@ -1,7 +1,8 @@
-"""Checks between cells: duplicates, references, graph, nominal voltages, doubtful units.
+"""Checks between cells: duplicates, references, graph, nominal voltages, line matrices, doubtful units.
 
 `to_volt` of a line is the nominal voltage of its `to_bus`, where that of its `from_bus` differs. It applies
-on the way from the busbar; a line that closes a loop must agree with both its ends.
+on the way from the busbar; a line that closes a loop must agree with both its ends. The loader uses the same
+graph: fused buses, a tree below the busbar, loops, islands.
 
 Each doubt has a name; `accept = ["<name>"]` in feeder.toml turns it into a note. Each check takes the valid
 cells. A row with an invalid cell takes part in every check that does not need that cell, so that one run
@@ -13,16 +14,26 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
-from feeders.format import matrices
-from feeders.format.columns import LineRow
-from feeders.format.reader import CheckReport, Parsed, rows, some
-from feeders.format.topology import Edge, Tree, closed_tree, tree
+import numpy as np
+
+from feeders.format.columns import (
+    MATRIX_NAMES,
+    PAIRS,
+    SERIES_NAMES,
+    SHUNT_NAMES,
+    CheckReport,
+    LineRow,
+    Parsed,
+    rows,
+    some,
+)
 from feeders.profiles import load_names, pv_names
-from gridsec.arrays import Floats
+from gridsec.arrays import Bools, Floats, Phasors
 from gridsec.errors import Problem
-from gridsec.grid.droop import PRESETS
+from gridsec.grid.devices import PRESETS
 
 SAME_LEVEL: Final = 1e-6
 """Relative difference of two nominal voltages that count as equal: 230.94 and 400 / sqrt(3)."""
@@ -241,7 +252,7 @@ def check(parsed: Parsed, report: CheckReport) -> None:
     """Report every problem between cells, and notable content."""
     for each in (_duplicates, _reserved, _limits, _power_factors, _presets, _profiles, _positions, _taps):
         each(parsed, report)
-    matrices.check(parsed, report)
+    check_matrices(parsed, report)
     edges, found = _graph(parsed, report)
     _units(parsed, edges, found, report)
 
@@ -491,3 +502,276 @@ def _taps(parsed: Parsed, report: CheckReport) -> None:
                 f"{where}, columns {', '.join(given)}: expected {', '.join(wanted)}, those of phases "
                 f"{cells['phases']!r}, and no tap beside them; or tap alone, of all of them",
             )
+
+
+# --- Graph of the feeder ---
+
+
+LOOPS_SHOWN = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """Closed line: id, buses, impedance zero or not, nominal voltage at its end, number of phases."""
+
+    line: str
+    from_bus: str
+    to_bus: str
+    zero: bool
+    to_volt: float | None = None
+    phases: int = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Tree:
+    """Part of the feeder that is connected to the busbar, in topological order."""
+
+    group: dict[str, int]  # Fused bus index of every connected bus; 0 is the busbar
+    buses: tuple[str, ...]  # One id per fused bus: the first of its members in the order of the input
+    parent: tuple[int, ...]  # Fused bus that feeds bus k + 1; always at most k
+    branch: tuple[int, ...]  # Index (into the edges given) of the line that feeds bus k + 1
+    # Indices of the edges that close loops: each joins two buses that are connected without it
+    ties: tuple[int, ...]
+    # Indices of the edges of each loop: of every tie that joins a bus to itself, and of at most LOOPS_SHOWN
+    # others. A radial feeder has none
+    loops: tuple[tuple[int, ...], ...]
+    islands: tuple[tuple[str, ...], ...]  # Unconnected buses, one tuple for each connected piece
+
+
+class _Sets:
+    """Disjoint sets of buses; the representative is the first member in the order of the input."""
+
+    def __init__(self, order: Iterable[str]) -> None:
+        self.rank = {bus: k for k, bus in enumerate(dict.fromkeys(order))}
+        self.above = {bus: bus for bus in self.rank}
+
+    def find(self, bus: str) -> str:
+        root = bus
+        while self.above[root] != root:
+            root = self.above[root]
+        while self.above[bus] != root:
+            self.above[bus], bus = root, self.above[bus]
+        return root
+
+    def join(self, one: str, other: str) -> bool:
+        """Unite the sets of two buses; False if both are in one set already."""
+        a, b = self.find(one), self.find(other)
+        if a == b:
+            return False
+        first, second = (a, b) if self.rank[a] < self.rank[b] else (b, a)
+        self.above[second] = first
+        return True
+
+
+def closed_tree(busbar: str, lines: Iterable[LineRow]) -> tuple[list[LineRow], Tree]:
+    """Closed lines of a feeder, and their tree."""
+    closed = [row for row in lines if row.closed]
+    edges = [Edge(row.line, row.from_bus, row.to_bus, row.fuses, phases=len(row.phases)) for row in closed]
+    return closed, tree(busbar, edges)
+
+
+def tree(busbar: str, edges: Sequence[Edge], others: Iterable[str] = ()) -> Tree:
+    """Fuse the buses at both ends of closed lines without impedance and walk the others from the busbar.
+
+    `others` are further buses that need a connection, such as ends of open lines.
+    """
+    order = [busbar, *(bus for edge in edges for bus in (edge.from_bus, edge.to_bus)), *others]
+    fused, connected = _Sets(order), _Sets(order)
+    for edge in edges:
+        if edge.zero:
+            fused.join(edge.from_bus, edge.to_bus)
+            connected.join(edge.from_bus, edge.to_bus)
+    neighbours: dict[str, list[tuple[int, str]]] = {bus: [] for bus in fused.rank}
+    closing = _closing(edges, connected)
+    for k, edge in enumerate(edges):
+        if not edge.zero and k not in closing:
+            a, b = fused.find(edge.from_bus), fused.find(edge.to_bus)
+            neighbours[a].append((k, b))
+            neighbours[b].append((k, a))
+    index, parent, branch = _walk(fused.find(busbar), neighbours)
+    short = [k for k in closing if fused.find(edges[k].from_bus) == fused.find(edges[k].to_bus)]
+    shown = sorted([*short, *[k for k in closing if k not in short][:LOOPS_SHOWN]])
+    loops = tuple(_loop(k, edges[k], fused, neighbours) for k in shown)
+    pieces: dict[str, list[str]] = {}
+    for bus in fused.rank:
+        if fused.find(bus) not in index:
+            pieces.setdefault(connected.find(bus), []).append(bus)
+    return Tree(
+        {bus: index[fused.find(bus)] for bus in fused.rank if fused.find(bus) in index},
+        tuple(index),
+        parent,
+        branch,
+        tuple(closing),
+        loops,
+        tuple(map(tuple, pieces.values())),
+    )
+
+
+def _closing(edges: Sequence[Edge], connected: _Sets) -> list[int]:
+    """Edges that close loops, preferably those of fewer phases and the later ones (Kruskal).
+
+    The tree of the other edges has the largest possible sum of phases. If any tree brings every phase of each
+    bus, this one does: such a tree has that sum, the number of buses with the phase less one, over the
+    phases.
+    """
+    order = sorted((k for k, edge in enumerate(edges) if not edge.zero), key=lambda k: -edges[k].phases)
+    return sorted(k for k in order if not connected.join(edges[k].from_bus, edges[k].to_bus))
+
+
+def _walk(
+    root: str, neighbours: dict[str, list[tuple[int, str]]]
+) -> tuple[dict[str, int], tuple[int, ...], tuple[int, ...]]:
+    """Number the buses depth first, branch by branch, as in an operator's diagram."""
+    index: dict[str, int] = {}
+    parent: list[int] = []
+    branch: list[int] = []
+    stack = [(root, -1, -1)]
+    while stack:
+        bus, above, line = stack.pop()
+        index[bus] = len(index)
+        if above >= 0:
+            parent.append(above)
+            branch.append(line)
+        stack.extend((b, index[bus], k) for k, b in reversed(neighbours[bus]) if b not in index)
+    return index, tuple(parent), tuple(branch)
+
+
+def _loop(
+    closing: int, edge: Edge, fused: _Sets, neighbours: dict[str, list[tuple[int, str]]]
+) -> tuple[int, ...]:
+    """Edges of the loop that one more edge closes: that edge and the path between its ends."""
+    start, goal = fused.find(edge.from_bus), fused.find(edge.to_bus)
+    came: dict[str, tuple[int, str] | None] = {start: None}
+    stack = [start]
+    while stack and goal not in came:
+        bus = stack.pop()
+        for k, other in neighbours[bus]:
+            if other not in came:
+                came[other] = (k, bus)
+                stack.append(other)
+    path = [closing]
+    step = came.get(goal)
+    while step is not None:
+        path.append(step[0])
+        step = came[step[1]]
+    return tuple(path)
+
+
+# --- Matrices of lines ---
+
+
+MATRIX_PHASES: Final = "abc"
+
+ROUNDING: Final = 1e-6
+"""Tolerance of passivity and singularity, relative to the largest entry of a matrix."""
+
+AGREEMENT: Final = 1e-3
+"""Tolerance of r_ohm, x_ohm and b_us against the positive sequence, relative to the largest entry."""
+
+UPPER: Final = np.triu_indices(3)
+
+
+def cells_of(line: LineRow) -> dict[str, float | None]:
+    """Matrix cells of a row by column name."""
+    return {name: getattr(line, name) for name in MATRIX_NAMES}
+
+
+def series_ohm(cells: Mapping[str, Any]) -> Phasors | None:
+    """Impedance matrix of a row in phases, ohm, with 0 in absent ones; None without a matrix."""
+    r, x = _symmetric(cells, "r", "ohm"), _symmetric(cells, "x", "ohm")
+    return None if r is None or x is None else r + 1j * x
+
+
+def shunt_us(cells: Mapping[str, Any]) -> Floats | None:
+    """Matrix of the total shunt susceptances of a row in phases, microsiemens; as `series_ohm`."""
+    return _symmetric(cells, "b", "us")
+
+
+def _symmetric(cells: Mapping[str, Any], symbol: str, unit: str) -> Floats | None:
+    upper = [cells.get(f"{symbol}_{pair}_{unit}") for pair in PAIRS]
+    if all(value is None for value in upper):
+        return None
+    matrix = np.zeros((3, 3))
+    matrix[UPPER] = [0.0 if value is None else value for value in upper]
+    return np.triu(matrix) + np.triu(matrix, 1).T
+
+
+def columns_of(symbol: str, unit: str, matrix: Floats, present: Bools) -> dict[str, float]:
+    """Cells of a symmetric matrix (3, 3) by column name, without those of absent phases.
+
+    `symbol` and `unit` are "r" and "ohm", "x" and "ohm", or "b" and "us"; `present` (3,) is a mask.
+    """
+    return {
+        f"{symbol}_{pair}_{unit}": float(matrix[i, j])
+        for pair, i, j in zip(PAIRS, *UPPER, strict=True)
+        if present[i] and present[j]
+    }
+
+
+def positive_sequence(matrix: Phasors | Floats) -> complex:
+    """Mean of the diagonal less the mean of the other entries: the value for balanced currents."""
+    count = len(matrix)
+    own = complex(np.trace(matrix))
+    return own / count - (complex(matrix.sum()) - own) / max(count * (count - 1), 1)
+
+
+def passive(matrix: Floats) -> bool:
+    """True for a positive semidefinite matrix, real and symmetric, up to rounding."""
+    return bool(np.linalg.eigvalsh(matrix)[0] >= -ROUNDING * np.abs(matrix).max())
+
+
+def check_matrices(parsed: Parsed, report: CheckReport) -> None:
+    """Report every matrix that is incomplete, inconsistent or physically impossible."""
+    needed = ("phases", "r_ohm", "x_ohm", "r0_ohm", "x0_ohm", "b_us", *MATRIX_NAMES)
+    for where, cells in rows(parsed.lines, *needed):
+        for names, matrix in ((SERIES_NAMES, series_ohm(cells)), (SHUNT_NAMES, shunt_us(cells))):
+            given = [name for name in names if cells[name] is not None]
+            if given and _complete(where, cells, names, given, report) and matrix is not None:
+                _content(where, cells, matrix, report)
+
+
+def _complete(
+    where: str, cells: Mapping[str, Any], names: tuple[str, ...], given: list[str], report: CheckReport
+) -> bool:
+    """True for a matrix without missing and surplus cells."""
+    phases = cells["phases"]
+    if len(phases) == 1:
+        text = f"{where}, column {given[0]}: a matrix, but phases is {phases!r}; expected none"
+        report.problem("inconsistent", text)
+        return False
+    wanted = [name for name in names if set(name.split("_")[1]) <= set(phases)]
+    missing = [name for name in wanted if name not in given]
+    extra = [name for name in given if name not in wanted]
+    if missing:
+        expected = "expected the whole matrix or nothing of it"
+        report.problem("missing", f"{where}, columns {', '.join(missing)}: missing; {expected}")
+    if extra:
+        text = f"of a conductor that is not in phases {phases!r}; expected none"
+        report.problem("absent-phase", f"{where}, columns {', '.join(extra)}: {text}")
+    return not missing and not extra
+
+
+def _content(where: str, cells: Mapping[str, Any], whole: Phasors | Floats, report: CheckReport) -> None:
+    """Report entries that no passive line has, and contradictions to the row's other cells."""
+    here = [MATRIX_PHASES.index(phase) for phase in sorted(cells["phases"])]
+    matrix = whole[np.ix_(here, here)]
+    one, largest = positive_sequence(matrix), float(np.abs(matrix).max())
+    series = np.iscomplexobj(matrix)
+    parts = [("r_ohm", one.real), ("x_ohm", one.imag)] if series else [("b_us", one.real)]
+    for name, value in parts:
+        if abs(cells[name] - value) > AGREEMENT * largest:
+            report.problem(
+                "inconsistent",
+                f"{where}, column {name}: {cells[name]:g} is not the positive sequence of the line's matrix; "
+                f"expected {value:.6g}, the mean of its diagonal less that of the rest",
+            )
+    if not passive(matrix.real):
+        fault = "r_aa_ohm to r_cc_ohm: generate power" if series else "b_aa_us to b_cc_us: no capacitances"
+        report.problem("not-definite", f"{where}, columns {fault}; expected a positive semidefinite matrix")
+    if series and (cells["r0_ohm"] is not None or cells["x0_ohm"] is not None):
+        report.problem(
+            "inconsistent", f"{where}, columns r0_ohm and x0_ohm: beside a matrix; expected one of the two"
+        )
+    if series and min(np.linalg.svd(matrix, compute_uv=False)[-1], abs(one)) <= ROUNDING * largest:
+        expected = "expected conductors with impedances of their own"
+        report.problem("singular", f"{where}, columns r_aa_ohm to x_cc_ohm: are singular; {expected}")

@@ -22,16 +22,13 @@ from typing import Any
 
 import numpy as np
 
-from feeders.format.columns import PHASE_NAMES
-from feeders.format.reader import CUSTOMERS_FILE, LINES_FILE, META_FILE, advice
+from feeders.format.columns import CUSTOMERS_FILE, LINES_FILE, META_FILE, PHASE_NAMES, advice
 from feeders.format.tables import CustomerRow, FeederTables, LineRow, read, to_json
-from feeders.format.topology import Tree, closed_tree
-from feeders.format.validation import nominal_volts
+from feeders.format.validation import Tree, closed_tree, nominal_volts
 from feeders.profiles import data_root
 from gridsec.arrays import Bools, Floats, Ints, frozen, frozen_ints
 from gridsec.errors import FeederInvalid, Problem
-from gridsec.grid.droop import Droop, fleet
-from gridsec.grid.meter import MeterAccuracy
+from gridsec.grid.devices import Droop, MeterAccuracy, fleet
 
 # Reported active powers beyond this factor of the customer's range, and this power, are implausible.
 CREDIBLE_FACTOR = 10.0

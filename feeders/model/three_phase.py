@@ -14,9 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from feeders.format.columns import FeederTables, LineRow
-from feeders.format.matrices import cells_of, series_ohm, shunt_us
 from feeders.format.tables import validate
-from feeders.format.topology import Tree
+from feeders.format.validation import Tree, cells_of, series_ohm, shunt_us
 from feeders.model.equipment import (
     Equipment,
     Referred,

@@ -21,8 +21,7 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 
 from feeders.report import section_calibrate, section_campaign, section_droop, section_meters
 from feeders.report.drawing import NARROW, WIDE, Figure, style, svg
-from feeders.report.legends import legend
-from feeders.report.text import Finding, Question, Section, Standing, Value, counted, number, plural
+from feeders.report.text import Finding, Question, Section, Standing, Value, counted, legend, number, plural
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -14,8 +14,7 @@ import numpy as np
 
 from feeders.simulation.demand import Customers, Stream, generator
 from feeders.simulation.plant import ClosedLoop, Loads
-from feeders.simulation.powerflow import PowerFlowDiverged
-from feeders.simulation.powerflow_three_phase import power_flow
+from feeders.simulation.powerflow import PowerFlowDiverged, power_flow
 from gridsec.arrays import Floats, Ints
 from gridsec.attack import (
     Attack,

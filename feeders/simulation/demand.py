@@ -19,7 +19,7 @@ from scipy.signal import lfilter
 
 from feeders.profiles import Season, library, profile
 from gridsec.arrays import Floats
-from gridsec.grid.network import InPhases
+from gridsec.grid.phased import InPhases
 
 if TYPE_CHECKING:
     from feeders.model.site import Site

@@ -24,7 +24,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from feeders.simulation.demand import Variation
-from feeders.simulation.meters import BUSBAR, Channel, MeterErrors, MeterOutage
+from feeders.simulation.plant import BUSBAR, Channel, MeterErrors, MeterOutage
 from feeders.simulation.scenario import Scenario, Season, SimulatedReading, SimulatedTick, simulate
 from feeders.util import plain
 from gridsec import attack as attacks

@@ -19,8 +19,17 @@ from feeders.model.site import Snapshot
 from feeders.profiles import Season
 from feeders.simulation.attacks import random_attacks
 from feeders.simulation.demand import Variation
-from feeders.simulation.meters import BUSBAR, Channel, Delivery, MeterErrors, Registers, SimulatedMeters
-from feeders.simulation.plant import PlantTrajectory, net_reactive, truth
+from feeders.simulation.plant import (
+    BUSBAR,
+    Channel,
+    Delivery,
+    MeterErrors,
+    PlantTrajectory,
+    Registers,
+    SimulatedMeters,
+    net_reactive,
+    truth,
+)
 from feeders.util import own_numbers
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Attack, InverterAttack, Reports, apply_all, manipulated, reach

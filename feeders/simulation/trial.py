@@ -19,7 +19,7 @@ import numpy as np
 from feeders.model.site import Site, from_tables, to_frame
 from feeders.simulation.attacks import AttackKind, AttackSpec, manipulations
 from feeders.simulation.demand import Customers, Variation
-from feeders.simulation.meters import MeterErrors
+from feeders.simulation.plant import MeterErrors
 from feeders.simulation.scenario import START, SUNNY_NOON_S, Scenario, SimulatedTick, simulate, snapshots
 from feeders.util import own_numbers
 from gridsec.arrays import Bools, Floats, Ints
@@ -28,7 +28,7 @@ from gridsec.errors import choice
 from gridsec.interface import Decision, Frame, Verdict
 
 if TYPE_CHECKING:
-    from feeders.registry.registry import DesignedEstimator
+    from feeders.registry import DesignedEstimator
 
 __all__ = [
     "STEADY",

@@ -1,6 +1,6 @@
 """Comparison of all estimators on the same trials of one feeder.
 
-Every estimator of `feeders.registry.registry.FAMILIES` processes the same frames: full AC power flow as
+Every estimator of `feeders.registry.FAMILIES` processes the same frames: full AC power flow as
 truth, meters with the accuracy of the feeder's files, loads known up to a stated error. An estimator without
 a design for the feeder, or with a failure in a step, keeps its rows, with the reason.
 """
@@ -18,12 +18,11 @@ import numpy as np
 import pandas as pd
 
 from feeders.model.site import Site
-from feeders.registry.plugins import EstimatorUnusable
-from feeders.registry.registry import FAMILIES, DesignedEstimator, choose, design
+from feeders.registry import FAMILIES, DesignedEstimator, EstimatorUnusable, choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec, NoSuchAttack
 from feeders.simulation.demand import Variation
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, TrialResult, frames, judge
-from feeders.studies.journal import Journal, Where
+from feeders.studies.running import Journal, Where
 from feeders.util import replace_file
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, GridsecError, NotObservable, Problem, no_choice, raise_if_any

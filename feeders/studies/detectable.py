@@ -15,12 +15,10 @@ import numpy as np
 import pandas as pd
 
 from feeders.format.tables import FeederTables
-from feeders.model.load_uncertainty import load_doubt
-from feeders.model.site import Site, from_tables, plant
-from feeders.studies.journal import Progress, Runner, Where, run_pieces
+from feeders.model.site import Site, from_tables, load_doubt, plant
 from feeders.studies.operating import SHARE, box, volts_of_lie
+from feeders.studies.running import Here, Progress, Runner, Where, cores, run_pieces
 from feeders.studies.unobservable import CurvePositions
-from feeders.studies.workers import Here, cores
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, Problem, raise_if_any
 from gridsec.estimators.sequential import SequentialOptions

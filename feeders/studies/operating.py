@@ -12,15 +12,14 @@ from typing import Final, Self
 
 import numpy as np
 
-from feeders.format.topology import Edge, tree
+from feeders.format.validation import Edge, tree
 from feeders.model.forecast import always
-from feeders.model.load_uncertainty import unread
-from feeders.model.site import Site, Snapshot, to_frame
+from feeders.model.site import Site, Snapshot, to_frame, unread
 from feeders.model.three_phase import ThreePhaseSite
 from feeders.studies.unobservable import CurvePositions, customer_indices
 from gridsec.arrays import Floats
 from gridsec.errors import choice
-from gridsec.grid.meter import busbar_error, reading_error
+from gridsec.grid.devices import busbar_error, reading_error
 from gridsec.grid.network import Power
 from gridsec.interface import Frame
 from gridsec.planning.redundancy import from_busbar

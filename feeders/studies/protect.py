@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 
 from feeders.model.site import Site
-from feeders.studies.journal import Journal, Where
 from feeders.studies.operating import SHARE, box, false_powers, squared, volts_of_lie
+from feeders.studies.running import Journal, Where
 from feeders.studies.unobservable import Attack, CurvePositions, knowledge, meter_mask, see_names
 from gridsec.arrays import Bools, Ints
 from gridsec.errors import DesignInfeasible, Problem, choice, no_choice, raise_if_any
@@ -141,7 +141,7 @@ def protect(
     never: meters that cannot be protected.
     exact: True: prove the smallest number; otherwise greedy, with `gap`.
     Raises DesignInfeasible if no protection of the other meters suffices; ValueError for an unknown customer
-        or meter, or as `check`; OtherStudy, InUse as `feeders.studies.journal.Journal`.
+        or meter, or as `check`; OtherStudy, InUse as `feeders.studies.running.Journal`.
     """
     check(
         max_attacked=max_attacked,

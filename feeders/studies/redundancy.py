@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from feeders.model.site import Site
-from feeders.studies.journal import Progress, Where, worked
+from feeders.studies.running import Progress, Where, worked
 from feeders.studies.unobservable import Attack, CurvePositions, Knowledge, knowledge, see_names
 from gridsec.errors import DesignInfeasible
 from gridsec.planning.redundancy import (
@@ -93,7 +93,7 @@ def redundancy(
     The arguments are those of `feeders.studies.unobservable.knowledge`.
 
     Raises ValueError for an unknown customer, meter or region of the curves; OtherStudy, InUse as
-        `feeders.studies.journal.Journal`.
+        `feeders.studies.running.Journal`.
     """
     see_names(site, unknown=unknown, meters=silent, curves=curves)
     curves = CurvePositions(curves)

@@ -18,7 +18,7 @@ intervals. So the code word is
     s = B xi + v + e,    xi = ((x - x_0) / free, d_p / p_error, d_q / q_error, d_v0 / error),    |xi| <= 1,
 
 with the rows of meter j as block j, each in units of its own worst-case bound from
-`gridsec.estimators.thresholds`. All C(p, M) fits without M meters are computed at every frame
+`gridsec.estimators.detection`. All C(p, M) fits without M meters are computed at every frame
 (`gridsec.secure.decode.search`). Shared errors are one unknown, not one for every meter; this provides the
 evidence.
 
@@ -44,30 +44,36 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible, NotObservable
-from gridsec.estimators import thresholds
-from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, no_counts
-from gridsec.estimators.inputs import (
+from gridsec.estimators import detection
+from gridsec.estimators.detection import (
+    Counters,
+    DecisionInputs,
+    ErrorBound,
+    Motion,
+    TickUncertainty,
+    count,
+    decide,
+    no_counts,
+)
+from gridsec.estimators.plant import (
     NO_VOLTAGE,
+    EstimatorContext,
     Inputs,
+    Options,
+    Plant,
     PreviousStep,
     Reconstruction,
     busbar_errors,
+    check_plant,
     clean,
+    estimator_context,
     injections,
     known,
     nothing_new,
     reconstruct,
-)
-from gridsec.estimators.plant import (
-    EstimatorContext,
-    Options,
-    Plant,
-    check_plant,
-    estimator_context,
     usual_options,
 )
-from gridsec.estimators.thresholds import ErrorBound, Motion, TickUncertainty
-from gridsec.grid.meter import reading_error
+from gridsec.grid.devices import reading_error
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.observers import circle
 from gridsec.observers.certificates import Certificate, verify
@@ -131,7 +137,7 @@ class CodeWord:
 
 def start(setting: EstimatorContext) -> Parts:
     """State before the first frame: only the saturation of the inverters is known."""
-    zero, widest = np.zeros(setting.plant.droop.tau.size), thresholds.widest(setting.errors)
+    zero, widest = np.zeros(setting.plant.droop.tau.size), detection.widest(setting.errors)
     return Parts(zero, zero, zero, widest, widest)
 
 
@@ -153,9 +159,9 @@ def observe(  # noqa: PLR0917  # the observers, their state, and the inputs
     base = np.minimum(inputs.now.base + seen.moved, NO_VOLTAGE)
     alone = replace(inputs.now, base=base, live=no_meters, told=no_meters)
     z = plant.droop.vbar**2 - seen.v2[own]
-    lag = np.where(thresholds.slowed(errors, h, POLICY), np.abs(x - before.x), 0.0)
+    lag = np.where(detection.slowed(errors, h, POLICY), np.abs(x - before.x), 0.0)
     motion = Motion(before.z if h > 0 else z, z, np.zeros(x.shape), h, lag)
-    bound, level = thresholds.advance(errors, alone, motion, before.bound, before.level)
+    bound, level = detection.advance(errors, alone, motion, before.bound, before.level)
     heard = np.zeros(x.shape, dtype=np.bool_)
     driven = x
     if inputs.live.size:
@@ -171,7 +177,7 @@ def observe(  # noqa: PLR0917  # the observers, their state, and the inputs
 
 def _settled(setting: EstimatorContext, alone: TickUncertainty, motion: Motion, bound: ErrorBound) -> bool:
     errors = setting.errors
-    transient = np.maximum(bound.free - thresholds.at_rest(errors, alone, motion).free, 0.0)
+    transient = np.maximum(bound.free - detection.at_rest(errors, alone, motion).free, 0.0)
     excess = errors.inverters[errors.meters] @ transient
     allowed = alone.reading + alone.base[errors.meters]
     return bool(np.all(excess <= setting.options.settled * allowed))
@@ -483,7 +489,7 @@ def _estimate(  # noqa: PLR0917  # as _conclude
     v2_bus = model.v2_bus + 2.0 * (lines.R_bus @ dp + lines.X_bus @ dq) + plant.feeder.broadcast_busbar(d0)
     v2 = v2_bus[plant.feeder.bus]
     # Under any attack, the bound of the observer without meters holds; and so does that of one credible fit.
-    gap = thresholds.gap(design.setting.errors, alone, after.parts.bound)
+    gap = detection.gap(design.setting.errors, alone, after.parts.bound)
     low, high = model.v2 - gap, model.v2 + gap
     fine = found.credible
     if fine.any():

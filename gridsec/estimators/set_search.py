@@ -6,7 +6,7 @@ all of its readings agree with its estimate, and search for another one only if 
 1. *One observer.* Inverters with a trusted meter are driven by that meter's reading, all others by the
    model; the set may change at any moment (`gridsec.observers.certificates`).
 2. *Test.* `|y_j - yhat_j| <= threshold_j(t)` for every trusted meter j. The threshold is the worst case of
-   `gridsec.estimators.thresholds` for exactly this set. After a switch it starts from the saturation bound
+   `gridsec.estimators.detection` for exactly this set. After a switch it starts from the saturation bound
    and falls as the transient of the observer decays.
 3. *Search.* If the test fails, every set D of at most M dropped meters is tried, the smallest first, and
    among equals the one with the smallest residuals. D passes if all other meters are within `threshold_j(D)`,
@@ -37,30 +37,37 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible, NotObservable, Problem
-from gridsec.estimators import thresholds
-from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, no_counts
+from gridsec.estimators import detection
+from gridsec.estimators.detection import (
+    Counters,
+    DecisionInputs,
+    ErrorBound,
+    ErrorModel,
+    Motion,
+    TickUncertainty,
+    count,
+    decide,
+    no_counts,
+)
 from gridsec.estimators.exact_bank import bank as banks
-from gridsec.estimators.inputs import (
+from gridsec.estimators.plant import (
+    EstimatorContext,
     Inputs,
+    Options,
+    Plant,
     PreviousStep,
     Reconstruction,
+    check_plant,
     clean,
+    estimator_context,
     injections,
     known,
     nothing_new,
     reconstruct,
-)
-from gridsec.estimators.plant import (
-    EstimatorContext,
-    Options,
-    Plant,
-    check_plant,
-    estimator_context,
     usual_options,
 )
 from gridsec.estimators.single_tick import MOST_SETS
-from gridsec.estimators.thresholds import ErrorBound, ErrorModel, Motion, TickUncertainty
-from gridsec.grid.meter import reading_error
+from gridsec.grid.devices import reading_error
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.observers.certificates import Certificate, certify
 from gridsec.observers.lure import close_loop
@@ -105,7 +112,7 @@ class SetSearchState:
     x: Floats  # (m,) its estimate, pu
     z: Floats  # (m,) its z at the inverters, squared pu
     y: Floats  # (p,) last readings as z, squared pu; NaN where missing
-    # bound, level: bounds on its error if no trusted meter is manipulated, see `thresholds.advance`
+    # bound, level: bounds on its error if no trusted meter is manipulated, see `detection.advance`
     bound: ErrorBound
     level: ErrorBound
     # (m,) bound on the error of inverters with an unmanipulated own meter, under any other attack, pu
@@ -170,7 +177,7 @@ def design(
 
 def init(design: SetSearchDesign, t: float) -> SetSearchState:
     """Initial state at Unix time t, s; the observer starts with the first frame and trusts all meters."""
-    plant, widest = design.setting.plant, thresholds.widest(design.errors)
+    plant, widest = design.setting.plant, detection.widest(design.errors)
     m, p = plant.droop.tau.size, plant.meters.size
     return SetSearchState(
         t=t,
@@ -220,14 +227,14 @@ def advance(design: SetSearchDesign, state: SetSearchState, frame: Frame, inputs
     seen = reconstruct(watched, frame, inputs, injections(plant, frame, x, none))
     z = droop.vbar**2 - seen.v2[droop.customer]
     now = replace(inputs.now, base=inputs.now.base + seen.moved, live=J)
-    lag = np.where(thresholds.slowed(errors, h, design.bank.policy), np.abs(x - state.x), 0.0)
+    lag = np.where(detection.slowed(errors, h, design.bank.policy), np.abs(x - state.x), 0.0)
     before = z if state.bank is None else state.z
     motion = Motion(before=before, after=z, offset=np.zeros(x.shape), h=h, lag=lag)
     handed = state.bound
     if state.bank is not None:
-        handed = thresholds.handed_over(errors, handed, state.bank.seen, J)
-    bound, level = thresholds.advance(errors, now, motion, handed, state.level)
-    error = thresholds.gap(errors, now, bound)
+        handed = detection.handed_over(errors, handed, state.bank.seen, J)
+    bound, level = detection.advance(errors, now, motion, handed, state.level)
+    error = detection.gap(errors, now, bound)
     threshold = threshold_of(design, seen.v2[at], error[at])
     score = np.where(inputs.live, np.abs(inputs.y - seen.v2[at]), np.nan)
     after = replace(
@@ -282,7 +289,7 @@ def _settled(
     design: SetSearchDesign, now: TickUncertainty, motion: Motion, error: Floats, threshold: Floats
 ) -> bool:
     """True once the remaining transient is negligible against every threshold."""
-    rest = thresholds.gap(design.errors, now, thresholds.at_rest(design.errors, now, motion))
+    rest = detection.gap(design.errors, now, detection.at_rest(design.errors, now, motion))
     transient = (error - rest)[design.setting.plant.meters]
     return bool(np.all(transient <= design.setting.options.settled * threshold))
 
@@ -367,7 +374,7 @@ def _conclude(  # noqa: PLR0917  # design, state and frame, then the results of 
     bound, level, settled = view.state.bound, view.state.level, view.state.settled
     if switched:
         free = np.where(driven_by(design, live & ~dropped), bound.free, design.errors.span)
-        bound, level, settled = ErrorBound(view.state.sure, free), thresholds.widest(design.errors), False
+        bound, level, settled = ErrorBound(view.state.sure, free), detection.widest(design.errors), False
     after = replace(
         view.state,
         bound=bound,
@@ -389,7 +396,7 @@ def _error(design: SetSearchDesign, view: TrustedEstimate, torn: bool) -> Floats
     errors, sure = design.errors, view.state.sure
     if torn:
         return np.asarray(view.base + errors.inverters @ errors.span)
-    most = thresholds.largest(lost(errors, sure), design.setting.max_attacked)
+    most = detection.largest(lost(errors, sure), design.setting.max_attacked)
     return np.asarray(view.base + errors.inverters @ sure + most)
 
 

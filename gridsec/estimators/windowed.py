@@ -5,7 +5,7 @@ manipulated meters in either, two observers J and S differ at inverter i by at m
 
     |x_J,i - x_S,i| <= level_J,i + level_S,i,    level_J,i = driven_i if J has the meter of i, else free_i.
 
-`driven` and `free` are the worst-case bounds of `gridsec.estimators.thresholds`: meters at the limits of
+`driven` and `free` are the worst-case bounds of `gridsec.estimators.detection`: meters at the limits of
 their class, loads anywhere in their intervals, remainders of losses and sampling, and the transient. They
 belong to the frame, so that the thresholds of yang2019 (10) and (19), one number each, become one for every
 inverter and tick; pi and pi_J are measured in them, and evidence is a value above 1. A window of N readings
@@ -34,11 +34,11 @@ import numpy as np
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import DesignInfeasible, Problem, no_choice, raise_if_any
 from gridsec.estimators import exact_bank
+from gridsec.estimators.detection import ErrorBound
 from gridsec.estimators.exact_bank import bank as banks
 from gridsec.estimators.exact_bank.direct import SlotState
 from gridsec.estimators.exact_bank.step import MonitorDesign, MonitorState
 from gridsec.estimators.plant import Plant
-from gridsec.estimators.thresholds import ErrorBound
 from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
 from gridsec.secure.windows import Rule, detection, isolation
 

@@ -33,11 +33,10 @@ from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints, pu
 from gridsec.errors import FeederInvalid, Problem, wrong_shapes
 from gridsec.grid import three_phase
 from gridsec.grid.intervals import Sweeps, bounds
-from gridsec.grid.network import Balanced, InPhases, LinDistFlow, OfMatrices, WithMatrices, unbounded
-from gridsec.grid.phased import PhasedFeeder
+from gridsec.grid.network import Balanced, LinDistFlow, OfMatrices, OnTree, WithMatrices, unbounded
+from gridsec.grid.phased import InPhases, PhasedFeeder
 from gridsec.grid.radial import Feeder, common_paths, line_problems
 from gridsec.grid.three_phase import PHASES, ROTATION, ThreePhaseFeeder, customers_at, named
-from gridsec.grid.trees import OnTree
 
 
 class _Admittances(WithMatrices, Protocol):

@@ -8,15 +8,58 @@ first three. R and X are not symmetric, and their entries have either sign.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, frozen, frozen_ints, put
 from gridsec.errors import FeederInvalid, Problem
 from gridsec.grid import three_phase
-from gridsec.grid.network import InPhases, OfMatrices, unbounded
+from gridsec.grid.network import Network, OfMatrices, OnTree, unbounded
 from gridsec.grid.three_phase import PHASES, ThreePhaseFeeder, customers_at, lindist3flow
-from gridsec.grid.trees import OnTree
+
+
+class _OnThreePhases(Protocol):
+    @property
+    def tree(self) -> ThreePhaseFeeder: ...
+
+
+class InPhases:
+    """Methods of feeders with three busbar voltages: place ``3 k + phi`` is phase phi of bus k."""
+
+    __slots__ = ()
+
+    @property
+    def busbar_phases(self) -> int:
+        """See `Network`."""
+        return 3
+
+    @property
+    def customer_bus(self: _OnThreePhases) -> Ints:
+        """See `Network`."""
+        return self.tree.at
+
+    def busbar_places(self) -> slice:
+        """See `Network`."""
+        return slice(0, 3)
+
+    def places(self: _OnThreePhases, buses: Ints) -> Ints:
+        """See `Network`."""
+        at, phase = np.nonzero(self.tree.phases[buses])
+        return np.asarray(3 * buses[at] + phase)
+
+    def same_busbar_phase(self, some: Ints, others: Ints) -> Floats:
+        """See `Network`."""
+        return np.equal.outer(some % 3, others % 3).astype(np.float64)
+
+    def busbar_incidence(self: Network) -> Floats:
+        """See `Network`."""
+        return np.equal.outer(self.bus % 3, np.arange(3)).astype(np.float64)
+
+    def broadcast_busbar(self: Network, of_busbar: Floats | float) -> Floats:
+        """See `Network`."""
+        each = np.broadcast_to(np.asarray(of_busbar, dtype=np.float64), 3)
+        return np.tile(each, len(self.buses) // 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

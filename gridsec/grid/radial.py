@@ -16,8 +16,19 @@ import numpy as np
 
 from gridsec.arrays import Floats, Ints, all_of, any_of, frozen, frozen_ints, put
 from gridsec.errors import FeederInvalid, InputInvalid, Problem, wrong_shapes
-from gridsec.grid.network import Balanced, LinDistFlow, Power
-from gridsec.grid.trees import Walk, at_ends, base_problems, below, duplicates, from_root, shrinking, walk
+from gridsec.grid.network import (
+    Balanced,
+    LinDistFlow,
+    Power,
+    Walk,
+    at_ends,
+    base_problems,
+    below,
+    duplicates,
+    from_root,
+    shrinking,
+    walk,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -33,7 +33,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints, Phasors, frozen, frozen_ints, put
 from gridsec.errors import FeederInvalid, InputInvalid, Problem, wrong_shapes
 from gridsec.grid.intervals import Sweeps, bounds
-from gridsec.grid.trees import (
+from gridsec.grid.network import (
     Walk,
     at_ends,
     base_problems,

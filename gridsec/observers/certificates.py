@@ -21,7 +21,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
 from gridsec.errors import DesignInfeasible
-from gridsec.grid.droop import Droop
+from gridsec.grid.devices import Droop
 from gridsec.observers.lure import Lure, Matrices
 
 # Shares of 1 / slope on the diagonal of P that `reactance` tries, see Theorem 1.

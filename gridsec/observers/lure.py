@@ -21,7 +21,7 @@ from scipy.linalg import expm
 
 from gridsec.arrays import Bools, Floats, Ints, exponential_integrals, frozen, perron_bound
 from gridsec.errors import DesignInfeasible, FeederInvalid, InputInvalid, Problem, raise_if_any
-from gridsec.grid.droop import Droop
+from gridsec.grid.devices import Droop
 from gridsec.grid.network import LinDistFlow, Network, Power
 from gridsec.grid.three_phase import CustomerFlow, ThreePhaseFeeder, lindist3flow, per_customer
 

@@ -21,7 +21,7 @@ from scipy.integrate import solve_ivp
 from gridsec.arrays import Floats, Ints
 from gridsec.errors import InputInvalid
 from gridsec.estimators.exact_bank import bank as banks
-from gridsec.grid.droop import Droop, fleet
+from gridsec.grid.devices import Droop, fleet
 from gridsec.grid.radial import Feeder
 from gridsec.observers.certificates import reactance
 from gridsec.observers.gains import CircleGains, margin, options_for

@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 
 from gridsec.arrays import Floats
-from gridsec.grid.droop import Droop, fleet
+from gridsec.grid.devices import Droop, fleet
 from gridsec.grid.radial import Feeder
 from gridsec.observers.lmi.sampled import advance, measure
 from gridsec.observers.lure import Lure, close_loop

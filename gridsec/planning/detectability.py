@@ -25,8 +25,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.fault_dictionary import false_power_charge
-from gridsec.estimators.sequential.search import Limits, set_cost
+from gridsec.estimators.sequential.search import Limits, false_power_charge, set_cost
 from gridsec.planning.collusion import Corridor, Shift, corridor, furthest
 
 __all__ = ["Rule", "Shift", "largest_shift", "named_size", "rule", "within"]

@@ -15,7 +15,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from feeders.registry.plugins import EstimatorUnusable
+from feeders.registry import EstimatorUnusable
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
 from service.access.identity import IssuerUnavailable, NotAuthenticated, NotPermitted, TooManyFailures
 from service.alarms.state_machine import AlarmUnknown, AlreadyAcknowledged, RaisedAgain

@@ -226,7 +226,7 @@ def _feeders(chosen: Settings, stored: Mapping[str, str]) -> tuple[int, list[Fin
     """
     from feeders.format.tables import from_json
     from feeders.model.site import from_tables, load
-    from feeders.registry.registry import choose, design
+    from feeders.registry import choose, design
     from gridsec.errors import GridsecError
 
     def given(name: str) -> Site:

@@ -68,8 +68,7 @@ def feeders_show(feeder: Feeder) -> None:
 @app.command("estimators")
 def feeders_estimators() -> None:
     """List the estimators."""
-    from feeders.registry.plugins import EstimatorUnusable
-    from feeders.registry.registry import FAMILIES
+    from feeders.registry import FAMILIES, EstimatorUnusable
 
     table = Table("name", "summary")
     for name in FAMILIES:
@@ -128,7 +127,7 @@ def feeders_design(
     """Design a feeder's estimator in advance; slow designs are cached for the next start."""
     from feeders.format.columns import ESTIMATORS
     from feeders.model.site import load
-    from feeders.registry.registry import choose, design
+    from feeders.registry import choose, design
     from gridsec.errors import no_choice
 
     problems = no_choice("--estimator", ESTIMATORS, *([estimator] if estimator else []))

@@ -303,7 +303,7 @@ def simulate(
     Faster than real time needs a service with `--clock events`.
     """
     from feeders.model.site import load
-    from feeders.simulation.meters import Channel, MeterErrors
+    from feeders.simulation.plant import Channel, MeterErrors
     from feeders.simulation.recording import record, truth_path
     from feeders.simulation.scenario import Scenario, Season
     from feeders.simulation.scenario import check as see_attacks

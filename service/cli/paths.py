@@ -10,7 +10,7 @@ from itertools import permutations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from feeders.format.reader import META_FILE
+from feeders.format.columns import META_FILE
 from feeders.util import replace_file
 from gridsec.errors import GridsecError, InputInvalid, Problem
 

@@ -43,7 +43,7 @@ def replay(
     Use the `--estimator`, `--max-skew` and `--grace` of the live service, from its options or GRIDSEC_...
     variables: this command does not read the variables.
     """
-    from feeders.registry.registry import choose
+    from feeders.registry import choose
     from feeders.simulation.recording import RecordingInvalid, read_recording
     from service.alarms.state_machine import to_json
     from service.engine.replay import ReplayCounts

@@ -20,7 +20,7 @@ from rich.control import Control
 from rich.markup import escape
 from rich.segment import ControlType
 
-from feeders.studies.journal import InUse, Journal, Keeper, OtherStudy, remove
+from feeders.studies.running import InUse, Journal, Keeper, OtherStudy, remove
 from gridsec.errors import DesignInfeasible, NotObservable
 from service.cli import console
 from service.cli.console import print_error
@@ -146,8 +146,8 @@ def keeping(
     """
     if without and journal is not None:
         raise typer.BadParameter("excludes --journal", param_hint="--no-journal")
-    from feeders.registry.design_cache import folder as cache_folder
-    from feeders.studies.workers import ClusterUnusable, WorkerLost
+    from feeders.registry import cache_folder
+    from feeders.studies.running import ClusterUnusable, WorkerLost
 
     where = None if without else folder or cache_folder() / "journals"
     kept = Keeping(study, feeder, journal, where, stay=folder is not None)

@@ -12,7 +12,7 @@ from itertools import count
 import msgspec
 
 from feeders.model.site import Site
-from feeders.simulation.meters import BUSBAR
+from feeders.simulation.plant import BUSBAR
 from feeders.simulation.scenario import Scenario, SimulatedReading, SimulatedTick, simulate
 from service.ingest.zenoh_bus import MeterClient
 

@@ -37,7 +37,7 @@ def converted(feeder: str, out: Path | None) -> str:
     """
     from feeders.convert.convert import convert
     from feeders.convert.provenance import CHANGES_FILE, BusbarUnclear
-    from feeders.format.reader import FOREIGN
+    from feeders.format.columns import FOREIGN
 
     if Path(feeder).is_dir() or not FOREIGN.fullmatch(feeder):
         return feeder

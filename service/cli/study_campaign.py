@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from feeders.model.site import Site
     from feeders.studies.campaign.plan import AttackClass, CampaignPlan
     from feeders.studies.campaign.study import Campaign
-    from feeders.studies.journal import Runner
+    from feeders.studies.running import Runner
 
 
 SHORTEST: Final = 10  # smallest number of readings of a scenario: attacks start after a tenth of it
@@ -77,7 +77,7 @@ def planned(
 
 def sources(site: Site, plan: CampaignPlan, given: Mapping[str, object]) -> str:
     """Summary of a campaign, with the origin of its parameters: files, or options with a value."""
-    from feeders.model.load_uncertainty import load_doubt
+    from feeders.model.site import load_doubt
 
     some = {option for option, value in given.items() if value is not None}
     asked = "--step", "--estimator", "--alarms-per-year"
@@ -369,6 +369,6 @@ def _setting(text: str) -> tuple[str, float]:
 
 
 def _runner(workers: int | None, dask: str | None) -> Runner:
-    from feeders.studies.workers import Dask, cores
+    from feeders.studies.running import Dask, cores
 
     return cores(workers) if dask is None else Dask(dask)

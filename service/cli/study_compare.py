@@ -65,7 +65,7 @@ def compare(
     that cannot monitor the feeder are listed with the reason.
     """
     from feeders.model.site import load
-    from feeders.registry.registry import FAMILIES
+    from feeders.registry import FAMILIES
     from feeders.simulation.trial import LoadError, TrialMeterErrors
     from feeders.studies.comparison import CASES, ComparisonPlan, markdown, splice, write_csv
     from feeders.util import replace_file

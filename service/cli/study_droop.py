@@ -98,19 +98,19 @@ def droop(
     plot: Plot = None,
 ) -> None:
     """Study the volt/VAR fleet: stability with margins, voltage band, and hosting capacity."""
-    from feeders.studies.droop.fleets import NOTHING, NoInverters, Who
+    from feeders.studies.droop.fleets import NOTHING, Equipped, NoInverters
     from feeders.studies.droop.study import DroopOptions
     from gridsec.errors import no_choice
-    from gridsec.grid.droop import PRESETS
+    from gridsec.grid.devices import PRESETS
 
     fleets = hosting_preset or ["none", "ieee1547-b"]
     existing = ("none", *PRESETS)
-    problems = [*no_choice("--who", Who, who), *no_choice("--hosting-preset", existing, *fleets)]
+    problems = [*no_choice("--who", Equipped, who), *no_choice("--hosting-preset", existing, *fleets)]
     usual = DroopOptions()
     options = options_of(
         lambda: DroopOptions(
             preset=preset,
-            who=Who(who) if who in tuple(Who) else usual.who,
+            who=Equipped(who) if who in tuple(Equipped) else usual.who,
             interval_s=interval,
             dead=dead,
             v0_low=busbar[0],

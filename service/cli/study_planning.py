@@ -20,8 +20,8 @@ from service.cli.sources import converted
 from service.cli.study_words import Output, Plot, cell_text
 
 if TYPE_CHECKING:
-    from feeders.studies.journal import Progress as Tell
     from feeders.studies.protect import Protect
+    from feeders.studies.running import Progress as Tell
 
 Unknown = Annotated[
     list[str] | None,

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from feeders.report.build import Report
     from feeders.report.html import Result, StudyOutcome
     from feeders.studies.campaign.plan import CampaignPlan
-    from feeders.studies.journal import Progress
+    from feeders.studies.running import Progress
     from service.cli.session import Keeping
 
 
@@ -127,7 +127,7 @@ def _calibrate(site: Site, asked: Asked, **kept: Any) -> Result:
 
 def _campaign(site: Site, asked: Asked, **kept: Any) -> Result:
     from feeders.studies.campaign.study import campaign
-    from feeders.studies.workers import cores
+    from feeders.studies.running import cores
 
     return campaign(site, plan(site, asked), runner=cores(asked.workers), **kept)
 
@@ -364,7 +364,7 @@ def report(
     from feeders.format.columns import ESTIMATORS
     from feeders.studies.protect import check as see_question
     from gridsec.errors import no_choice
-    from gridsec.grid.droop import PRESETS
+    from gridsec.grid.devices import PRESETS
 
     problems: list[str] = []
     chosen = _studies(studies, tuple(STUDIES), recorded=readings is not None, problems=problems)

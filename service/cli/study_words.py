@@ -71,7 +71,7 @@ class Output:
     def explain(self, columns: list[str]) -> None:
         """Print one line for each column that is not explained yet."""
         from feeders.report.html import UNKNOWN
-        from feeders.report.legends import legend
+        from feeders.report.text import legend
 
         new = [name for name in columns if name not in self._explained]
         self._explained |= {*new}

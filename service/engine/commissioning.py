@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from feeders.model.site import Site
-from feeders.registry.registry import BiasLearning, DesignedEstimator
+from feeders.registry import BiasLearning, DesignedEstimator
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import GridsecError, Problem
 from gridsec.estimators.sequential import (

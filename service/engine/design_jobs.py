@@ -16,7 +16,7 @@ import structlog
 
 from feeders.format.tables import from_json
 from feeders.model.site import Site, from_tables
-from feeders.registry.registry import DesignedEstimator
+from feeders.registry import DesignedEstimator
 from gridsec.errors import FeederInvalid, GridsecError, Problem
 from service.engine.feeder_monitor import FeederMonitor, design
 

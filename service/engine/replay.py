@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from feeders.model.site import Site
-from feeders.simulation.meters import BUSBAR
+from feeders.simulation.plant import BUSBAR
 from feeders.simulation.scenario import SimulatedReading as Recorded
 from gridsec.interface import Decision
 from service.alarms.state_machine import AlarmBook

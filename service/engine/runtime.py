@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import structlog
 
 from feeders.model.site import Site
-from feeders.registry.registry import DesignedEstimator
+from feeders.registry import DesignedEstimator
 from gridsec.errors import GridsecError
 from service.alarms.state_machine import Alarm
 from service.engine import design_jobs

@@ -17,10 +17,10 @@ import pytest
 from benchmarks.clean_days import Run, main, plan, play
 from feeders.model.site import Snapshot, from_tables, load, to_frame
 from feeders.profiles import Season
-from feeders.registry.registry import design
+from feeders.registry import design
 from feeders.simulation.attacks import AttackKind, random_attacks
 from feeders.simulation.demand import Variation
-from feeders.simulation.meters import MeterErrors
+from feeders.simulation.plant import MeterErrors
 from feeders.simulation.scenario import START, Scenario, SimulatedReading, simulate
 from gridsec.arrays import Floats
 from gridsec.interface import Decision

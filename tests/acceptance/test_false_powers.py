@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import load, to_frame
-from feeders.registry.registry import SEQUENTIAL, choose, design
+from feeders.registry import SEQUENTIAL, choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec, manipulations
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.interface import Cause, Decision

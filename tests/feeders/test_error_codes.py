@@ -20,20 +20,18 @@ import pyarrow.parquet as pq
 import pytest
 
 import feeders
+from feeders import registry
 from feeders.convert.convert import convert
 from feeders.convert.from_simbench import envelope
 from feeders.convert.network import below, busbar_of
 from feeders.convert.source import SourceNetwork
 from feeders.format.tables import CustomerRow, FeederTables, LineRow, from_json, read, to_json, write
-from feeders.model.load_uncertainty import from_history
-from feeders.model.site import from_tables, load
+from feeders.model.site import from_history, from_tables, load
 from feeders.model.three_phase import three_phase
-from feeders.registry import plugins
-from feeders.registry.registry import Estimator, choose
+from feeders.registry import Estimator, choose
 from feeders.simulation.attacks import AttackKind, random_attacks
 from feeders.simulation.demand import Variation
-from feeders.simulation.meters import Channel
-from feeders.simulation.plant import ClosedLoop, Loads
+from feeders.simulation.plant import Channel, ClosedLoop, Loads
 from feeders.simulation.powerflow import PowerFlow
 from feeders.simulation.recording import read_recording
 from feeders.simulation.scenario import Scenario, simulate
@@ -42,9 +40,8 @@ from feeders.studies.calibrate.readings import frames
 from feeders.studies.calibrate.study import Calibrate
 from feeders.studies.campaign.study import campaign
 from feeders.studies.droop.study import droop
-from feeders.studies.journal import Journal
 from feeders.studies.protect import Goal, protect
-from feeders.studies.workers import Dask, Processes, agree
+from feeders.studies.running import Dask, Journal, Processes, agree
 from gridsec.attack import Bias
 from tests.feeders import stations, villages
 from tests.feeders.studies.campaign.campaigns import PLAN, SITE
@@ -101,7 +98,7 @@ def limited() -> Any:
 
 def large() -> Any:
     write(street(), "street")
-    with patch("feeders.format.reader.MAX_BYTES", 0):
+    with patch("feeders.format.columns.MAX_BYTES", 0):
         return read("street")
 
 
@@ -163,7 +160,7 @@ def opendss() -> Any:
 
 
 def foreign_worker() -> Any:
-    with patch("feeders.studies.workers.versions", lambda: {"numpy": "2.0"}):
+    with patch("feeders.studies.running.versions", lambda: {"numpy": "2.0"}):
         return agree("tcp://a:1", {"numpy": "1.0"})
 
 
@@ -243,7 +240,7 @@ CALLS: dict[str, Callable[[], Any]] = {
     ),
     "three phases as a balanced feeder": lambda: load("ieee-european-lv").balanced,
     "no such estimator": lambda: choose(village(), estimator="oracle", max_attacked=-1),
-    "an estimator that no package offers": lambda: plugins.load("nobody", Estimator),
+    "an estimator that no package offers": lambda: registry.load_foreign("nobody", Estimator),
     "two sources": lambda: busbar_of(network(sources=("bb", "end")), [MAIN], None),
     "a second source": lambda: below(network(sources=("bb", "end")), "bb", ()),
     "no such bus": lambda: busbar_of(network(), [MAIN], "nowhere"),

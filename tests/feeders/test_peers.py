@@ -63,8 +63,8 @@ def test_the_mean_of_a_minute_is_quieter_but_powers_stay_wrong() -> None:
 
 
 def test_every_method_names_a_gross_liar(ready: Prepared) -> None:
-    here, everybody = ready
-    scores = measure(Cell(FEEDER, 0.001, 0.1, "bias", 1), here, everybody, trials=3, panda=2)
+    here, every = ready
+    scores = measure(Cell(FEEDER, 0.001, 0.1, "bias", 1), here, every, trials=3, panda=2)
     assert set(scores) == {OURS, *PEERS}
     for name, score in scores.items():
         assert score.trials == (2 if name == PANDA else 3)
@@ -74,8 +74,8 @@ def test_every_method_names_a_gross_liar(ready: Prepared) -> None:
 
 
 def test_ours_names_whose_powers_are_false_too(ready: Prepared) -> None:
-    here, everybody = ready
-    few = {name: everybody[name] for name in (OURS, "pgm 3.5")}
+    here, every = ready
+    few = {name: every[name] for name in (OURS, "pgm 3.5")}
     scores = measure(Cell(FEEDER, 0.001, 0.1, "coord+pq", 3), here, few, trials=12, panda=0)
     assert scores[OURS].exact >= 11
     assert scores[OURS].exact >= scores["pgm 3.5"].exact

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from feeders.model.site import Site, to_frame
-from feeders.registry.registry import design
+from feeders.registry import design
 from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
 from gridsec.interface import Decision
 

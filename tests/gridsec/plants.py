@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridsec.arrays import Floats, Ints
-from gridsec.grid.droop import fleet
+from gridsec.grid.devices import fleet
 from gridsec.grid.radial import Feeder
 from gridsec.observers.lure import Lure, close_loop
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gridsec.arrays import Floats
-from gridsec.grid.droop import Droop, fleet
+from gridsec.grid.devices import Droop, fleet
 from gridsec.grid.network import LinDistFlow
 from gridsec.grid.radial import Feeder
 from gridsec.observers.lure import Lure, close_loop

@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 
 from gridsec.estimators.exact_bank import bank as banks
-from gridsec.grid.droop import Droop, fleet
+from gridsec.grid.devices import Droop, fleet
 from gridsec.grid.radial import Feeder
 from gridsec.observers import lure as lures
 from gridsec.observers.lure import Lure, close_loop

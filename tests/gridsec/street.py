@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gridsec.estimators.plant import Plant
-from gridsec.grid.droop import Droop, fleet
-from gridsec.grid.meter import MeterAccuracy
+from gridsec.grid.devices import Droop, MeterAccuracy, fleet
 from gridsec.grid.radial import Feeder
 from gridsec.interface import Frame
 

@@ -8,7 +8,7 @@ from types import ModuleType
 import numpy as np
 
 from gridsec.estimators.plant import Plant
-from gridsec.grid.droop import Droop
+from gridsec.grid.devices import Droop
 from gridsec.grid.meshed import PhasedMesh
 from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.three_phase import ThreePhaseFeeder

@@ -19,7 +19,7 @@ from gridsec.estimators import exact_bank, windowed
 from gridsec.estimators.exact_bank import bank
 from gridsec.estimators.plant import Options
 from gridsec.estimators.sequential import LoadDoubt, SequentialOptions
-from gridsec.grid.droop import Droop, fleet, preset
+from gridsec.grid.devices import Droop, fleet, preset
 from gridsec.grid.meshed import MeshedFeeder
 from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.radial import Feeder

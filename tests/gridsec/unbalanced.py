@@ -6,7 +6,7 @@ import numpy as np
 
 from gridsec.arrays import Floats, Phasors
 from gridsec.grid.meshed import PhasedMesh
-from gridsec.grid.network import InPhases
+from gridsec.grid.phased import InPhases
 from gridsec.grid.three_phase import ThreePhaseFeeder
 
 

@@ -19,7 +19,7 @@ import pytest
 
 from feeders.format.tables import to_json, write
 from feeders.model.site import Site, from_tables, load
-from feeders.simulation.meters import Channel, MeterOutage
+from feeders.simulation.plant import Channel, MeterOutage
 from feeders.simulation.scenario import Scenario, SimulatedTick, random_attacks, simulate
 from service.cli.simulate import Pace, key_of, payload_of, play
 from service.store import Store

@@ -78,10 +78,10 @@ def test_every_problem_is_named_with_those_of_the_phases(site: Site) -> None:
 
 def test_phases_do_not_matter_to_a_balanced_feeder() -> None:
     village = load("kerber-landnetz")
-    nobody = (None,) * len(village.meter_ids)
+    none = (None,) * len(village.meter_ids)
     for phases in (None, (229.0, float("nan"), 233.0), (0.0, 0.0, 0.0)):
         busbar = Reading(village.feeder.name, None, START, 231.0, v_phases=phases)
-        said = snapshot(village, Tick(START, nobody, busbar, ()))
+        said = snapshot(village, Tick(START, none, busbar, ()))
         assert said.v0_volt == 231.0
         assert to_frame(village, said).v0_phases is None
 

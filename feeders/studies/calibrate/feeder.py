@@ -20,7 +20,7 @@ from feeders.studies.operating import line_rows
 from gridsec.arrays import Bools, Floats, Ints, Phasors
 from gridsec.errors import FeederInvalid, Problem
 from gridsec.grid import three_phase as three
-from gridsec.grid.droop import voltage_curve
+from gridsec.grid.devices import voltage_curve
 from gridsec.grid.meshed import MeshedFeeder, impedances
 from gridsec.grid.radial import Feeder
 from gridsec.grid.three_phase import PHASES, ThreePhaseFeeder, lindist3flow

@@ -20,7 +20,7 @@ from pandas.api.types import (
 
 from feeders.model.site import Site, one_phase_each
 from feeders.model.three_phase import ThreePhaseSite
-from feeders.simulation.meters import BUSBAR
+from feeders.simulation.plant import BUSBAR
 from feeders.simulation.recording import REQUIRED, Recording, RecordingInvalid, read_recording
 from feeders.simulation.scenario import LATEST_S
 from gridsec.arrays import Bools, Floats, Ints

@@ -43,7 +43,7 @@ from feeders.studies.calibrate.search import (
     left,
     prepare,
 )
-from feeders.studies.journal import Journal, Progress, Where
+from feeders.studies.running import Journal, Progress, Where
 from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid, InputInvalid, Problem, raise_if_any
 from gridsec.planning.calibration import explain, lengthened
@@ -637,7 +637,7 @@ def calibrate(
     Raises RecordingInvalid for readings of another feeder or of unknown meters, without the busbar, in other
         units than V, kW and kvar, or too few; ValueError for an unknown meter, or a number out of range;
         FeederInvalid if closed lines form loops in three phases; OtherStudy, InUse as
-        `feeders.studies.journal.Journal`.
+        `feeders.studies.running.Journal`.
     """
     problems = wrong_numbers(risk, tolerance)
     if unknown := sorted(set(exclude) - set(site.meter_ids)):

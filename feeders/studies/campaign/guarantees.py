@@ -18,8 +18,8 @@ from feeders.model.site import Site
 from feeders.simulation.attacks import AttackKind
 from feeders.studies.campaign.plan import AttackClass, Promise
 from feeders.studies.detectable import Detectable, monitor_rule
-from feeders.studies.journal import Progress, Where, run_pieces
 from feeders.studies.operating import SHARE, squared, volts_of_lie
+from feeders.studies.running import Progress, Where, run_pieces
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators import sequential
 from gridsec.estimators.sequential import LoadDoubt
@@ -64,7 +64,7 @@ def rehearse(
     beyond its size. In every second trial M - 1 other meters are attacked as well, by up to twice their size.
     `share` is that of `found`. An interrupted run resumes from its journal, also with more trials.
 
-    Raises OtherStudy, InUse as `feeders.studies.journal.Journal`.
+    Raises OtherStudy, InUse as `feeders.studies.running.Journal`.
     """
     sizes = [float(size) for name in ("hidden", "named", "named_alone") for size in found.meters[name]]
     told = {"max_attacked": found.max_attacked, "risk": found.risk, "sizes": sizes}

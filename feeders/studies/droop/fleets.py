@@ -13,14 +13,14 @@ from feeders.model.site import Site
 from feeders.studies.operating import Bases
 from gridsec.arrays import Floats, Ints
 from gridsec.errors import FeederInvalid, Problem, raise_if_any
-from gridsec.grid.droop import Droop, fleet
+from gridsec.grid.devices import Droop, fleet
 from gridsec.planning.droop.ac_sensitivity import InjectionBox
 
 __all__ = [
     "KVA_PER_KW",
     "NOTHING",
+    "Equipped",
     "NoInverters",
-    "Who",
     "box",
     "chosen_fleet",
     "equip",
@@ -40,7 +40,7 @@ class NoInverters(FeederInvalid):
     """A feeder without droop inverters: no fleet to study."""
 
 
-class Who(StrEnum):
+class Equipped(StrEnum):
     """Customers with an inverter of a preset."""
 
     PV = "pv"
@@ -50,7 +50,7 @@ class Who(StrEnum):
 _POINTS: Final = {"evening": (1.0, 0.0), "noon": (0.2, 1.0), "half": (0.5, 0.5)}  # load, generation
 
 
-def equip(site: Site, preset: str, who: Who = Who.PV) -> Droop:
+def equip(site: Site, preset: str, who: Equipped = Equipped.PV) -> Droop:
     """Equip customers of a feeder with inverters of one preset, in place of its own fleet.
 
     A customer's own inverter keeps its rating; others get 1.1 kVA for each kW of generation, or 5 kVA.
@@ -58,7 +58,7 @@ def equip(site: Site, preset: str, who: Who = Who.PV) -> Droop:
     Raises FeederInvalid for an unknown preset, or without a customer to equip.
     """
     rows = site.tables.customers
-    own = [k for k, row in enumerate(rows) if who is Who.ALL or row.pv_kw > 0 or row.inverter_kva > 0]
+    own = [k for k, row in enumerate(rows) if who is Equipped.ALL or row.pv_kw > 0 or row.inverter_kva > 0]
     if not own:
         text = f"{site.feeder.name}: no customer has generation; equip all (--who all)"
         raise FeederInvalid([Problem("nothing-to-design", text)])
@@ -73,7 +73,7 @@ def made(site: Site, own: Ints, preset: str, kva: Floats) -> Droop:
     return usual if (ratio == 1.0).all() else replace(usual, v=usual.v / ratio[:, None])
 
 
-def chosen_fleet(site: Site, preset: str | None, who: Who = Who.PV) -> Droop:
+def chosen_fleet(site: Site, preset: str | None, who: Equipped = Equipped.PV) -> Droop:
     """The feeder's own fleet, or one of a preset as in `equip`.
 
     Raises NoInverters without inverters and without a preset; FeederInvalid if a preset has no customer to

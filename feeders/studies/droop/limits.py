@@ -26,7 +26,7 @@ from feeders.studies.operating import Bases, line_rows
 from feeders.studies.unobservable import customer_indices
 from gridsec.arrays import Floats, Ints
 from gridsec.errors import DesignInfeasible
-from gridsec.grid.droop import Droop, voltage_curve
+from gridsec.grid.devices import Droop, voltage_curve
 from gridsec.planning.droop.ac_sensitivity import (
     Complex,
     InjectionBox,

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from feeders.model.site import Site
-from feeders.studies.droop.fleets import Who, box, chosen_fleet, equip, points, range_problem
+from feeders.studies.droop.fleets import Equipped, box, chosen_fleet, equip, points, range_problem
 from feeders.studies.droop.limits import (
     BandGuarantee,
     Conditions,
@@ -43,11 +43,11 @@ from feeders.studies.droop.verdict import (
     trajectories,
     worst,
 )
-from feeders.studies.journal import Progress, Where, worked
 from feeders.studies.operating import Bases
+from feeders.studies.running import Progress, Where, worked
 from feeders.util import word
 from gridsec.errors import InputInvalid, Problem, no_choice, raise_if_any
-from gridsec.grid.droop import PRESETS, Droop
+from gridsec.grid.devices import PRESETS, Droop
 from gridsec.planning.droop.ac_sensitivity import InjectionBox
 from gridsec.planning.droop.equilibrium import rest
 from gridsec.planning.droop.stability import Update, enlarged
@@ -73,7 +73,7 @@ class DroopOptions:
     """
 
     preset: str | None = None  # of all inverters; None: the feeder's own fleet
-    who: Who = Who.PV  # customers that a preset equips
+    who: Equipped = Equipped.PV  # customers that a preset equips
     interval_s: float = 1.0  # sampling of the inverters; 0: continuous
     dead: int = 0  # dead time, whole intervals
     v0_low: float = 1.0  # limits of the busbar voltage, pu; operating points have the middle
@@ -100,7 +100,7 @@ class DroopOptions:
             if name not in PRESETS:
                 text = f"preset {name!r} does not exist; expected one of {', '.join(PRESETS)}"
                 yield Problem("unknown-name", text)
-        yield from no_choice("`who`", Who, self.who)
+        yield from no_choice("`who`", Equipped, self.who)
         try:
             Update(self.interval_s, self.dead)
         except InputInvalid as error:
@@ -225,7 +225,7 @@ def droop(
     `seed` is that of small deviations from equilibrium, and of the orders of generation.
 
     Raises NoInverters without inverters and without a preset; ValueError for an invalid band, or new
-        generation at an unknown customer; OtherStudy, InUse as `feeders.studies.journal.Journal`.
+        generation at an unknown customer; OtherStudy, InUse as `feeders.studies.running.Journal`.
     """
     given = options or DroopOptions()
     study = _Study(Subject.of(site), chosen_fleet(site, given.preset, given.who), given, seed)

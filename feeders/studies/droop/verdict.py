@@ -19,13 +19,12 @@ import numpy as np
 import pandas as pd
 
 from feeders.model.site import Site
-from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged
-from feeders.simulation.powerflow_three_phase import PlacesFlow, power_flow
+from feeders.simulation.powerflow import PlacesFlow, PowerFlow, PowerFlowDiverged, power_flow
 from feeders.studies.droop.fleets import inverter_names, point
 from feeders.studies.operating import Bases
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, FeederInvalid
-from gridsec.grid.droop import Droop, voltage_curve
+from gridsec.grid.devices import Droop, voltage_curve
 from gridsec.planning.droop.ac_sensitivity import InjectionBox, PhasorNetwork, network, sensitivity
 from gridsec.planning.droop.equilibrium import Share, injected, rest, shares, shares_of_gain
 from gridsec.planning.droop.stability import Loop, Update, growth, loop, proof, reach, slopes, steepened

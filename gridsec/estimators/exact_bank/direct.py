@@ -24,7 +24,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid, Problem
-from gridsec.grid.droop import Droop
+from gridsec.grid.devices import Droop
 from gridsec.observers.lure import Lure, LureTransition, StepPolicy, transition, unit
 from gridsec.secure.subsets import Subsets
 

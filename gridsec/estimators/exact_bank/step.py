@@ -8,7 +8,7 @@ run it. A step never raises on data: outcomes are values.
 2. The bank takes one step; chong2020 (5). The set with the best agreement between its estimate and those
    of its subsets is selected, (6) and (7), among the sets without a named meter.
 3. The residuals of *all* meters against the selected estimate are compared with the largest value of an
-   unmanipulated meter (`gridsec.estimators.thresholds`). Attacks inside a droop curve's deadband do not move
+   unmanipulated meter (`gridsec.estimators.detection`). Attacks inside a droop curve's deadband do not move
    any estimate, so that agreement alone would not detect them.
 4. A meter is named with its `confirm`-th reading above the threshold, and until `release` consecutive
    readings are below it; the selection is repeated without the named meters.
@@ -23,23 +23,37 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import DesignInfeasible
-from gridsec.estimators import thresholds
-from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, no_counts, residual_excess
+from gridsec.estimators import detection
+from gridsec.estimators.detection import (
+    Counters,
+    DecisionInputs,
+    ErrorBound,
+    ErrorModel,
+    Majorant,
+    Motion,
+    count,
+    decide,
+    no_counts,
+    residual_excess,
+)
 from gridsec.estimators.exact_bank import bank as banks
 from gridsec.estimators.exact_bank.bank import StackedState
-from gridsec.estimators.inputs import (
+from gridsec.estimators.plant import (
+    EstimatorContext,
     Inputs,
+    Options,
+    Plant,
     PreviousStep,
     Reconstruction,
+    check_plant,
     clean,
     injections,
     known,
     nothing_new,
     reconstruct,
+    usual_options,
 )
-from gridsec.estimators.plant import EstimatorContext, Options, Plant, check_plant, usual_options
-from gridsec.estimators.thresholds import ErrorBound, ErrorModel, Majorant, Motion
-from gridsec.grid.meter import reading_error
+from gridsec.grid.devices import reading_error
 from gridsec.grid.network import LinDistFlow
 from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.certificates import Certificate, certify, small_gain, verify
@@ -131,7 +145,7 @@ def design(
     model = plant.feeder.linear()
     reactive = -2.0 * model.X[:, meters] if isinstance(gains, str) else None
     bank = banks.design(lure, max_attacked, gains=gains, reactive=reactive)
-    errors = thresholds.error_model(plant.droop, model, meters, max_attacked)
+    errors = detection.error_model(plant.droop, model, meters, max_attacked)
     proven = lure
     if bank.gains is not None:
         big = _majorant(lure, bank.gains)
@@ -201,7 +215,7 @@ def init(design: MonitorDesign, t: float) -> MonitorState:
         valid = verify(design.certificate, design.proven) > 0
     except DesignInfeasible:
         valid = False
-    widest = thresholds.widest(design.errors)
+    widest = detection.widest(design.errors)
     return MonitorState(
         t=t,
         valid=valid,
@@ -240,7 +254,7 @@ def step(design: MonitorDesign, state: MonitorState, frame: Frame) -> tuple[Moni
             unknown = _unknown(design, bank)
             state = replace(state, bound=unknown, level=unknown, settled=False)
         else:
-            bound = thresholds.handed_over(
+            bound = detection.handed_over(
                 design.errors, state.bound, before.seen, inputs.live, spread=state.spread
             )
             state = replace(state, bound=bound)
@@ -249,7 +263,7 @@ def step(design: MonitorDesign, state: MonitorState, frame: Frame) -> tuple[Moni
 
 def _unknown(design: MonitorDesign, bank: banks.BankState) -> ErrorBound:
     """Bound on the error of observers that just started."""
-    return thresholds.widest(design.errors, bank.x if isinstance(bank, StackedState) else None)
+    return detection.widest(design.errors, bank.x if isinstance(bank, StackedState) else None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -362,14 +376,14 @@ def _view(  # noqa: PLR0917  # as _conclude
     if told.any():
         held = np.bincount(own, weights=x, minlength=v2.size)[at] + inputs.q[at]
         doubt = np.where(told, np.abs(frame.q_net[at] - held), 0.0)
-        offset = offset + thresholds.largest(errors.reach * np.nan_to_num(doubt), errors.quota // 2)
+        offset = offset + detection.largest(errors.reach * np.nan_to_num(doubt), errors.quota // 2)
     now = replace(inputs.now, base=inputs.now.base + seen.moved)
     before = z if state.bank is None else state.z
-    lag = thresholds.slowed(errors, h, design.bank.policy) * (np.abs(x - state.x) + spread)
+    lag = detection.slowed(errors, h, design.bank.policy) * (np.abs(x - state.x) + spread)
     motion = Motion(before=before, after=z, offset=offset[own], h=h, lag=lag)
     if index >= 0:
-        bound, level = thresholds.advance(errors, now, motion, state.bound, state.level)
-        error = thresholds.gap(errors, now, bound) + offset
+        bound, level = detection.advance(errors, now, motion, state.bound, state.level)
+        error = detection.gap(errors, now, bound) + offset
     else:
         bound, level = state.bound, state.level
         error = _saturated(design, inputs, frame, x)
@@ -377,8 +391,8 @@ def _view(  # noqa: PLR0917  # as _conclude
     score = np.where(inputs.live, np.abs(inputs.y - v2[at]), np.nan)
     settled = state.settled
     if index >= 0 and not settled:
-        rest = thresholds.gap(errors, now, thresholds.at_rest(errors, now, motion))
-        transient = thresholds.gap(errors, now, bound)[at] - rest[at]
+        rest = detection.gap(errors, now, detection.at_rest(errors, now, motion))
+        transient = detection.gap(errors, now, bound)[at] - rest[at]
         settled = bool(np.all(transient <= design.options.settled * threshold))
     after = replace(
         state,
@@ -400,5 +414,5 @@ def _saturated(design: MonitorDesign, inputs: Inputs, frame: Frame, x: Floats) -
     """Error of the estimate (N,) under any attack: inverters saturate, and used reports are plausible."""
     errors = design.errors
     told = np.where(inputs.now.told, 2.0 * frame.q_error[design.plant.meters], 0.0)
-    far = thresholds.widest(errors, None if design.bank.gains is None else x).free
+    far = detection.widest(errors, None if design.bank.gains is None else x).free
     return np.asarray(inputs.now.base + errors.inverters @ far + errors.reach @ told)

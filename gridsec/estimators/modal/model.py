@@ -38,7 +38,7 @@ from scipy.linalg import cholesky, eigh, solve_triangular
 from gridsec.arrays import Floats, Ints, submatrix
 from gridsec.errors import Problem, raise_if_any
 from gridsec.estimators.sequential.design import YEAR_S, SequentialDesign
-from gridsec.estimators.sequential.load_uncertainty import prior
+from gridsec.estimators.sequential.posterior import voltage_prior
 
 FIXED_S = YEAR_S
 """Time constant of fixed errors, s. Meters age over years; with a day, lies of 0.5 %/h stay hidden."""
@@ -190,7 +190,7 @@ def residual_model(design: SequentialDesign) -> ResidualModel:
         an error that lasts.
     """
     feeder, doubt, meters = design.plant.feeder, design.doubt, design.prior.meters
-    loads = prior(feeder, meters, doubt, busbar=0.0, inverters=design.injections)
+    loads = voltage_prior(feeder, meters, doubt, busbar=0.0, inverters=design.injections)
     phases = design.busbar_incidence.shape[1]
     places = np.arange(loads.variance.size)
     return ResidualModel(

@@ -6,12 +6,16 @@
 
 Pipeline of `step`, by module:
 
-    measurements    plausibility of the frame; clock_offsets: readings of another moment
-    observer        injections of the inverters, voltages by the model (prediction)
-    time_scales     running means of the residuals and their limits (detection)
-    identify        likeliest sets of manipulated meters: search, hypotheses, busbar_meter
-    confirmation    lasting evidence without a likely rival; inverter_check, attack_kind, replay
-    output          estimate with bounds, verdict with reason
+    measurements   plausibility of the frame, clock offsets, uncertainty of the powers
+    observer       injections of the inverters, voltages by the model (prediction)
+    time_scales    running means of the residuals and their limits (detection)
+    identify       likeliest sets of manipulated meters by search, hypotheses and device_checks; confirmation
+                   by lasting evidence without a likely rival
+    attack_kind    kinds of the named manipulations, repeated readings
+    output         estimate with bounds, verdict with reason
+
+`posterior` is the Gaussian model below all of them, `state` the memory between ticks, and `meter_bias`
+the fixed errors learned at commissioning.
 
 One circle-criterion observer carries the inverters. Its certificate holds for every set of trusted meters and
 every switching between them. The residuals are explained by correlated load errors, by meter errors, and by
@@ -19,7 +23,6 @@ as few manipulated meters as possible.
 """
 
 from gridsec.estimators.sequential.design import SequentialDesign, SequentialOptions, design
-from gridsec.estimators.sequential.load_uncertainty import LoadDoubt
 from gridsec.estimators.sequential.meter_bias import (
     Commission,
     Learning,
@@ -30,9 +33,16 @@ from gridsec.estimators.sequential.meter_bias import (
     progress,
     to_arrays,
 )
-from gridsec.estimators.sequential.state import SequentialState, init, renew
+from gridsec.estimators.sequential.posterior import LoadDoubt
+from gridsec.estimators.sequential.state import (
+    SequentialState,
+    SuspicionRecord,
+    distrusted,
+    init,
+    renew,
+    warm_start,
+)
 from gridsec.estimators.sequential.step import step
-from gridsec.estimators.sequential.suspicion_record import SuspicionRecord, distrusted, warm_start
 
 __all__ = [
     "Commission",

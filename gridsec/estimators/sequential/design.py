@@ -15,16 +15,19 @@ from scipy.special import ndtri
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible, NotObservable, Problem, raise_if_any
+from gridsec.estimators.detection import curve_mismatch
 from gridsec.estimators.plant import Plant, check_plant, judging_problems
-from gridsec.estimators.sequential.attack_kind import KindReferences, LoadTraces, look_interval
-from gridsec.estimators.sequential.fault_dictionary import FaultDictionary, Sensitivities
-from gridsec.estimators.sequential.load_uncertainty import UNMETERED, LoadDoubt, injection_doubt, prior
-from gridsec.estimators.sequential.posterior import Prior
-from gridsec.estimators.sequential.replay import repeat_limits
-from gridsec.estimators.sequential.search import Decoder
-from gridsec.estimators.thresholds import curve_mismatch
-from gridsec.grid.meter import ToldError, busbar_error, steady_rounding
-from gridsec.grid.network import Network, Power
+from gridsec.estimators.sequential.attack_kind import KindReferences, LoadTraces, look_interval, repeat_limits
+from gridsec.estimators.sequential.posterior import (
+    UNMETERED,
+    LoadDoubt,
+    Prior,
+    injection_doubt,
+    voltage_prior,
+)
+from gridsec.estimators.sequential.search import Decoder, FaultDictionary
+from gridsec.grid.devices import ToldError, busbar_error, steady_rounding
+from gridsec.grid.network import Network, Power, Sensitivities
 from gridsec.observers.certificates import Certificate, certify, verify
 from gridsec.observers.lmi import contraction
 from gridsec.observers.lure import Lure, close_loop
@@ -218,7 +221,7 @@ def design(
     white, fixed, allowed, rounded = _noise(plant)
     injections = injection_doubt(plant.droop, plant.accuracy, meters, plant.feeder.bus.size)
     busbar = min(busbar_error(plant.accuracy, plant.droop.vbar**2, 2.0) / 2.0, UNMETERED)
-    known = prior(plant.feeder, plant.feeder.bus[meters], doubt, busbar=busbar, inverters=injections)
+    known = voltage_prior(plant.feeder, plant.feeder.bus[meters], doubt, busbar=busbar, inverters=injections)
     lengths = _lengths(options.scales_s, step_s)
     every = _look_intervals(lengths)
     tails = tuple(_tail(options.alarms_per_year, plant, n * step_s, len(lengths)) for n in every)
@@ -310,6 +313,8 @@ def _max_power(feeder: Network, power: Power) -> Floats:
 
 _LEAST_NOISE = 1e-12
 """Least variance of a reading, squared pu^2: two perfect meters at one bus make a singular matrix."""
+
+
 _CONVERSION_VOLTAGE = 1.03
 """Voltage that converts relative meter errors into squared ones, in parts of nominal."""
 
@@ -329,6 +334,8 @@ def _check(plant: Plant, doubt: LoadDoubt, step_s: float, most: int | None) -> N
 
 _FEWEST = 3
 """Fewest meters: two contradicting ones cannot be told apart."""
+
+
 _DECAY_PART = 0.1
 """Decay rate asked of the solver, as a part of the slowest inverter's."""
 

@@ -19,12 +19,10 @@ from scipy.linalg import lapack
 from scipy.special import binom
 
 from gridsec.arrays import Bools, Floats, Ints, any_of, indices, submatrix
-from gridsec.estimators.sequential import search
-from gridsec.estimators.sequential.busbar_meter import BusbarTest, contradicted_phases
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.fault_dictionary import FaultDictionary
-from gridsec.estimators.sequential.load_uncertainty import UNMETERED
+from gridsec.estimators.sequential.device_checks import BusbarTest, contradicted_phases
 from gridsec.estimators.sequential.posterior import (
+    UNMETERED,
     LeaveOneOut,
     Posterior,
     chi_square,
@@ -35,41 +33,69 @@ from gridsec.estimators.sequential.posterior import (
     well_conditioned,
 )
 from gridsec.estimators.sequential.search import (
+    NO_METERS,
     Candidate,
     Candidates,
+    FaultDictionary,
     Hypothesis,
     Limits,
     covers,
+    descend,
     merged,
     robust_set,
+    set_cost,
 )
+from gridsec.estimators.sequential.state import TrustState
 from gridsec.estimators.sequential.time_scales import Scales, ScaleTest, scale_test, update_posterior
-from gridsec.estimators.sequential.trust import TrustState
 
 _FEW = 32
 """Largest number of meters beyond their limits for a start from the trusted set."""
+
+
 _CLOSE = 8
 """Largest number of suspects for a search with each of them honest."""
+
+
 _TOGETHER = 0.5
 """Least prior correlation of two meters moved by the same loads."""
+
+
 _REVERSALS = 6
 """Largest number of rounds of reversed groups."""
+
+
 _EFFORT = 4e9
 """Limits group searches so that count x p^3 <= _EFFORT (about 2 s)."""
+
+
 _BESIDE = 3
 """Number of sets of suspects searched for false powers, and of neighbourhoods searched."""
+
+
 _NEAR = 8.0
 """Largest distance from the best cost for a closer comparison, in log(like)."""
+
+
 _PART = 2
 """Downdate a larger posterior only if it has at most 1/_PART extra meters."""
+
+
 _SEEDS, _LARGEST = 32, 64
 """Number of centres of neighbourhoods, and largest size."""
+
+
 _MOST = 724
 """Largest number of meters for neighbourhoods: each start takes a matrix of 8 bytes x meters^2, 4 MB."""
+
+
 _PARTS = 2
 """Groups with a common offset in one hypothesis."""
+
+
 _SIMILAR = 2
 """Largest ratio of the sizes of similar groups."""
+
+
 _CHANCE, _OFFSET_STD = 4.0, 0.2
 """Standard deviations of chi-square within chance; standard deviation of a common offset, squared pu."""
 
@@ -202,7 +228,7 @@ class HypothesisSearch:
         # Meters that are suspects only beside an honest busbar meter are trusted again.
         honest = wider._descend(wider._condition(wide.enough), np.zeros_like(wide.enough), fresh=True)
         best = min(best, honest, key=lambda one: one.cost)
-        charge = search.set_cost(int(np.count_nonzero(self.here.enough)), 1)
+        charge = set_cost(int(np.count_nonzero(self.here.enough)), 1)
         accused = (*best.faults, self.faults.std.size + phase)
         return Hypothesis(best.trusted, accused, best.charge + charge, best.cost + charge)
 
@@ -285,7 +311,7 @@ class HypothesisSearch:
             return
         b, between = weights[at], here.prior.among(at)
         std = np.sqrt(np.maximum(between.diagonal(), np.finfo(np.float64).tiny))
-        prices = np.array([search.set_cost(at.size, k) for k in range(1, largest + 1)])
+        prices = np.array([set_cost(at.size, k) for k in range(1, largest + 1)])
         groups: list[tuple[float, Ints]] = []
         for j in np.argsort(-(b * b) / Q.diagonal())[:_SEEDS].tolist():
             near = np.argsort(-between[j] / std, kind="stable")[:largest]
@@ -395,7 +421,7 @@ class HypothesisSearch:
         other = Hypothesis(end.trusted & ~kept, (), charge, 0.0)
         theirs = self._chi_squares(other, kept, alike)
         worse = max(more - less for more, less in zip(theirs, self._chi_squares(best), strict=True))
-        price = charge + search.set_cost(self.barred.size, dropped, self.design.max_attacked)
+        price = charge + set_cost(self.barred.size, dropped, self.design.max_attacked)
         return end, replace(other, cost=best.cost + price - self._accusation_cost(best) + worse)
 
     def _admissible(self, hypothesis: Hypothesis) -> bool:
@@ -416,12 +442,12 @@ class HypothesisSearch:
             return hypothesis
         suspects = int(np.count_nonzero(available & ~hypothesis.trusted))
         charges = self.faults.charges(np.array(accused, dtype=np.intp), hypothesis.trusted, suspects)
-        charge = float(charges.sum()) * search.set_cost(int(np.count_nonzero(available)), 1)
+        charge = float(charges.sum()) * set_cost(int(np.count_nonzero(available)), 1)
         return replace(hypothesis, faults=accused, charge=charge, cost=hypothesis.cost + charge)
 
     def _lowered_limits(self) -> Limits:
         """Limits of alternatives: every accusation that lowers the cost is tried; none names a meter."""
-        fair = float(np.sqrt(search.set_cost(self.barred.size, 1)))
+        fair = float(np.sqrt(set_cost(self.barred.size, 1)))
         return replace(self.here.limits, sigmas=min(self.here.limits.sigmas, fair))
 
     def _contradicting(self, j: int, unknowns: Floats) -> Bools:
@@ -476,12 +502,12 @@ class HypothesisSearch:
         size, most = int(np.count_nonzero(available)), self.design.max_attacked
 
         def surcharge(suspects: int) -> float:
-            return search.set_cost(size, suspects, most) - search.set_cost(size, suspects)
+            return set_cost(size, suspects, most) - set_cost(size, suspects)
 
         own = np.array([k for k in other.faults if k < self.faults.std.size], dtype=np.intp)
         own = own[self.faults.beside_suspect(own, other.trusted)]
         beyond = np.maximum(self.faults.charges(own, other.trusted, theirs) - 1.0, 0.0)
-        return surcharge(theirs) - surcharge(ours) + float(beyond.sum()) * search.set_cost(size, 1)
+        return surcharge(theirs) - surcharge(ours) + float(beyond.sum()) * set_cost(size, 1)
 
     def _reversal_cost(self, best: Candidate, other: Hypothesis) -> float:
         """Cost of a rival where groups change sides and each group has one common offset; infinite elsewhere.
@@ -587,14 +613,14 @@ class HypothesisSearch:
         keep: Bools,
         faults: FaultDictionary | None = None,
         *,
-        protected: Ints = search.NO_METERS,
+        protected: Ints = NO_METERS,
         pairs: bool = False,
         limits: Limits | None = None,
         fresh: bool = False,
         loo: LeaveOneOut | None = None,
     ) -> Candidate:
         here = self.here
-        return search.descend(
+        return descend(
             start,
             here.m,
             here.enough,
@@ -638,7 +664,7 @@ class HypothesisSearch:
 
     def _accusation_cost(self, hypothesis: Hypothesis) -> float:
         suspects = int(np.count_nonzero(~self._trusted(hypothesis)))
-        return hypothesis.charge + search.set_cost(self.barred.size, suspects, self.design.max_attacked)
+        return hypothesis.charge + set_cost(self.barred.size, suspects, self.design.max_attacked)
 
     def _trusted(self, hypothesis: Hypothesis) -> Bools:
         return np.where(self.here.enough, hypothesis.trusted, self.trust.trusted)

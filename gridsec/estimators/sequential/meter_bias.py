@@ -43,9 +43,8 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, submatrix
 from gridsec.errors import Problem, raise_if_any
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.frame_uncertainty import FrameUncertainty
-from gridsec.estimators.sequential.load_uncertainty import EXACT, UNMETERED
-from gridsec.estimators.sequential.posterior import invert_spd
+from gridsec.estimators.sequential.measurements import FrameUncertainty
+from gridsec.estimators.sequential.posterior import EXACT, UNMETERED, invert_spd
 from gridsec.estimators.sequential.search import LimitCache
 from gridsec.grid.network import Power
 from gridsec.interface import Frame, PowerOrigin
@@ -65,6 +64,8 @@ class LearningReason(StrEnum):
 
 
 REASONS = tuple(LearningReason)
+
+
 COUNTED = -1
 """Value in place of an index of `REASONS` for a tick that counts."""
 
@@ -286,9 +287,15 @@ def _mean_covariance(one: Floats, other: Floats) -> Floats:
 
 
 _KNOWN = tuple(f.name for f in fields(Learned))
+
+
 _GATHERED = ("total", "count", "time_s", "since")
+
+
 # Absent in texts of earlier versions.
 _WATCHED = "watched_s"
+
+
 _LOST = tuple(f"lost_s.{reason}" for reason in REASONS)
 
 
@@ -385,8 +392,12 @@ def _problems(design: SequentialDesign, arrays: Mapping[str, Floats]) -> list[Pr
 
 _WIDEST = 2.0
 """Largest standard deviation of a voltage at a tick that counts, in those of the design."""
+
+
 _PATIENCE = 2.0
 """Multiple of the expected time after which a meter is stalled."""
+
+
 _TIME_TOLERANCE = 1e-9
 """Part of an interval by which a quotient of times may exceed a whole number from rounding alone."""
 

@@ -5,6 +5,14 @@
 One certificate covers every trusted set and every switching (docs/theory-certificates.md). With all meters
 trusted a step is exact and costs O(m). The prediction of a frame is the loss-corrected model at the observed
 injections.
+
+The error e of every observed injection is bounded by a first-order lag of its input error,
+
+    tau_i |e_i|' <= -|e_i| + min(span_i, d_i (input error + hold) + mismatch),
+
+with `hold` the change of the inverter's voltage between frames; saturation keeps it finite. The input is a
+reading of a trusted meter or the model. Assumptions: inverters follow their curves, and a voltage stays
+between its values at two successive frames (docs/theory-detection.md for the lag and for `mismatch`).
 """
 
 from __future__ import annotations
@@ -15,16 +23,15 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices, submatrix
 from gridsec.errors import DesignInfeasible
-from gridsec.estimators.inputs import NO_VOLTAGE
+from gridsec.estimators.plant import NO_VOLTAGE, busbar_errors
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.error_bounds import (
+from gridsec.estimators.sequential.measurements import Measurements, PowerErrors
+from gridsec.estimators.sequential.state import (
     InjectionError,
-    PowerErrors,
+    ModelDriven,
+    SequentialState,
     unknown_injections,
-    update_injection_error,
 )
-from gridsec.estimators.sequential.measurements import Measurements
-from gridsec.estimators.sequential.state import ModelDriven, SequentialState
 from gridsec.observers.lure import POLICY, Lure, advance, step, transition
 
 _PATIENT = replace(POLICY, settled=0.0)
@@ -177,3 +184,46 @@ def _loop(design: SequentialDesign, rows: Ints) -> Lure:
         slope=droop.slope[rows],
         phi=droop.take(rows),
     )
+
+
+# --- Errors of the injections ---
+
+
+_ITERATIONS = 2
+"""Iterations of the monotone map of the model-driven inverters, from above."""
+
+
+def update_injection_error(
+    design: SequentialDesign,
+    before: InjectionError,
+    given: Floats,
+    free: tuple[Bools, PowerErrors, Bools | bool] | None,
+    h: float,
+) -> InjectionError:
+    """Errors a time h later.
+
+    given: (m,) squared voltage at each input, pu. free: inverters that follow the model, (m,), power errors,
+    and metered busbar phases; None where all follow their meters.
+    """
+    plant, droop, span = design.plant, design.plant.droop, before.span
+    hold = np.abs(given - before.input)
+    width = design.reading_errors.of(given)
+    wider = np.maximum(width, before.width)
+    target = np.minimum(span, droop.slope * (wider + hold) + design.mismatch)
+    if free is not None:
+        (which, powers, metered), size = free, plant.feeder.bus.size
+        # The map is monotone: from above its images stay above the error.
+        top = np.where(which, span, np.maximum(before.error, target))
+        lost, _ = powers.loss_error(plant, droop.per_customer(top, size))
+        meter = np.minimum(busbar_errors(plant, powers.v0_squared, design.sigmas[0]), NO_VOLTAGE)
+        known = np.where(metered, meter, NO_VOLTAGE)
+        busbar = plant.feeder.broadcast_busbar(known)[plant.feeder.bus]
+        for _ in range(_ITERATIONS):
+            model = powers.linear_error(plant, droop.per_customer(top, size)) + lost + busbar
+            width = np.where(which, model[droop.customer], width)
+            wider = np.maximum(width, before.width)
+            image = np.minimum(span, droop.slope * (wider + hold) + design.mismatch)
+            target = np.where(which, image, target)
+            top = np.where(which, np.maximum(before.error, image), top)
+    error = target + np.exp(-h / droop.tau) * (before.error - target)
+    return InjectionError(error, given, width, span)

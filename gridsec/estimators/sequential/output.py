@@ -1,5 +1,15 @@
 """Output of one tick: estimate with its error, verdict with its reason, sentences for the operator.
 
+The bound of the estimate covers all honest errors within their stated limits: an interval, not a probability.
+Accuracy classes and power factors err in one direction for years, and all of them may err together. The
+bound is a sum of worst cases:
+
+    |v2 - model| <= 2 |R| dp + 2 |X| (dq + e) + losses + busbar      everywhere
+    |v2 - y|     <= error of the reading                             at trusted meters
+
+e is the error of the observed injections. Powers reported by customers of suspect meters may be false by the
+sizes of the fault dictionary. The busbar voltage is metered, or eliminated by the trusted meters.
+
 References
 ----------
 docs/theory-sequential.md, sections 5 and 7.
@@ -7,26 +17,37 @@ docs/theory-sequential.md, sections 5 and 7.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, changed
-from gridsec.estimators.decision import DecisionInputs, decide
-from gridsec.estimators.sequential.busbar_meter import BusbarTrust, track_busbar
-from gridsec.estimators.sequential.clock_offsets import ClockSkew, largest_offset, unusable_offsets
+from gridsec.estimators.detection import DecisionInputs, decide
+from gridsec.estimators.plant import NO_VOLTAGE, Plant, busbar_errors
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.error_bounds import BoundedEstimate, BoundInputs
-from gridsec.estimators.sequential.frame_uncertainty import checked
+from gridsec.estimators.sequential.device_checks import BusbarTrust, track_busbar
 from gridsec.estimators.sequential.identify import Identification
-from gridsec.estimators.sequential.measurements import Measurements
+from gridsec.estimators.sequential.measurements import (
+    ClockSkew,
+    Measurements,
+    PowerErrors,
+    checked,
+    largest_offset,
+    unusable_offsets,
+)
 from gridsec.estimators.sequential.observer import Prediction
-from gridsec.estimators.sequential.posterior import Prior, leave_one_out
-from gridsec.estimators.sequential.state import SequentialState
-from gridsec.estimators.sequential.suspect_powers import DoubtedPowers, doubt_powers, vouched_posteriors
+from gridsec.estimators.sequential.posterior import (
+    DoubtedPowers,
+    Prior,
+    doubt_powers,
+    leave_one_out,
+    vouched_posteriors,
+)
+from gridsec.estimators.sequential.state import SequentialState, TrustState
 from gridsec.estimators.sequential.time_scales import min_readings
-from gridsec.estimators.sequential.trust import TrustState
+from gridsec.grid.devices import told_error
 from gridsec.grid.three_phase import PHASES
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, PowerOrigin, Verdict
 
@@ -151,6 +172,8 @@ def _estimate(
 
 
 _Finding = tuple[Decision, Cause, str]
+
+
 _REPLACEABLE = (Cause.AGREEMENT, Cause.AMBIGUOUS)
 """Causes that findings on inverters and loads replace."""
 
@@ -557,3 +580,102 @@ def _explanation(design: SequentialDesign, explanation: Explanation) -> str:
 def _list(names: list[str]) -> str:
     rest = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + rest
+
+
+# --- Bound of the estimate ---
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoundInputs:
+    """Inputs of the bound of one estimate. N customers, p meters."""
+
+    plant: Plant  # the feeder
+    powers: PowerErrors  # power errors of the frame
+    injected: Floats  # (m,) largest errors of the observed injections, pu
+    model: Floats  # (N,) voltages of the model, squared pu
+    busbar: Bools | bool  # busbar phases that are metered
+    y: Floats  # (p,) squared readings
+    trusted: Bools  # (p,) meters used by the estimate
+    checked: Callable[[], Bools]  # meters with a known customer's power, (p,); evaluated with the bound
+    sigmas: float  # standard deviations of jitter within an honest reading
+
+    def half_width(self, v2: Floats) -> Floats:
+        """Largest distance of the true squared voltages from v2, (N,), pu."""
+        plant, at = self.plant, self.plant.meters
+        injected = plant.droop.per_customer(self.injected, plant.feeder.bus.size)
+        lost, correction = self.powers.loss_error(plant, injected)
+        spread = np.minimum(self.powers.linear_error(plant, injected) + lost, NO_VOLTAGE)
+        reading, use = told_error(plant.accuracy, self.y, self.sigmas), self.trusted & self.checked()
+        ends = self._busbar(spread, reading, use)
+        low, high = (plant.feeder.broadcast_busbar(end)[plant.feeder.bus] for end in ends)
+        # The loss correction is that of the assumed busbar voltage.
+        moved = np.minimum(np.maximum(np.abs(low), np.abs(high)), NO_VOLTAGE)
+        base = plant.feeder.broadcast_busbar(self.powers.v0_squared)[plant.feeder.bus]
+        spread = spread + np.abs(correction) * moved / np.maximum(base - moved, _LEAST_BUSBAR)
+        low, high = self.model + low - spread, self.model + high + spread
+        own = np.where(use, reading, np.inf)
+        low[at], high[at] = _intersection(low[at], high[at], self.y - own, self.y + own)
+        return np.minimum(np.maximum(high - v2, v2 - low), NO_VOLTAGE)
+
+    def _busbar(self, spread: Floats, reading: Floats, use: Bools) -> tuple[Floats, Floats]:
+        """Interval of the busbar's squared voltage about the assumed one: by its meter, and by the others."""
+        plant, at = self.plant, self.plant.meters
+        known = np.atleast_1d(busbar_errors(plant, self.powers.v0_squared, self.sigmas))
+        known = np.where(self.busbar, known, np.inf)
+        off, room = self.y - self.model[at], np.where(use, reading + spread[at], np.inf)
+        reach = np.where(plant.feeder.busbar_incidence()[at] > 0.0, room[:, None], np.inf)
+        low = (off[:, None] - reach).max(axis=0, initial=-np.inf)
+        high = (off[:, None] + reach).min(axis=0, initial=np.inf)
+        return _intersection(-known, known, low, high)
+
+
+_LEAST_BUSBAR = 0.1
+"""Least squared busbar voltage of the loss correction, pu."""
+
+
+def _intersection(low: Floats, high: Floats, other_low: Floats, other_high: Floats) -> tuple[Floats, Floats]:
+    """Intersection of two intervals; their hull where they do not meet."""
+    below, above = np.maximum(low, other_low), np.minimum(high, other_high)
+    apart = below > above
+    return (
+        np.where(apart, np.minimum(low, other_low), below),
+        np.where(apart, np.maximum(high, other_high), above),
+    )
+
+
+# Placeholder of a bound that is not computed yet.
+_PENDING: Floats = np.zeros(0)
+
+
+class BoundedEstimate(Estimate):
+    """Estimate with a bound computed on first access, which takes half a step.
+
+    It keeps the arrays of its frame, which must not be changed.
+    """
+
+    __slots__ = ("_grounds",)
+    _grounds: BoundInputs
+
+    @classmethod
+    def of(
+        cls, grounds: BoundInputs, t: float, v2_bus: Floats, variance: Floats, x: Floats
+    ) -> BoundedEstimate:
+        """Estimate at Unix time t, s, with variance (n,) at every place."""
+        bus = grounds.plant.feeder.bus
+        made = cls(t, v2_bus[bus], _PENDING, v2_bus, grounds.trusted, x, np.sqrt(variance[bus]))
+        object.__setattr__(made, "_grounds", grounds)
+        return made
+
+    @property
+    def bound(self) -> Floats:
+        """Half-width of the interval around `v2` that contains the truth within the stated errors, (N,)."""
+        slot = Estimate.__dict__["bound"]
+        found: Floats = slot.__get__(self)
+        if found is _PENDING:
+            found = self._grounds.half_width(self.v2)
+            slot.__set__(self, found)
+        return found
+
+    @bound.setter
+    def bound(self, value: Floats) -> None:
+        Estimate.__dict__["bound"].__set__(self, value)

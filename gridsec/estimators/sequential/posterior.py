@@ -1,8 +1,10 @@
-"""Posterior of the voltages given trusted meters: Gaussian conditioning, updated one meter at a time.
+"""Prior and posterior of the voltages given trusted meters: Gaussian conditioning, one meter at a time.
 
-The unknown part of the buses' squared voltages is w ~ N(0, S) with S from
-`gridsec.estimators.sequential.load_uncertainty`; a meter at bus b reads ``m = w_b + e``, ``e ~ N(0, d)``. For
-trusted meters T
+Errors dp, dq of all customers move all voltages by ``2 R dp + 2 X dq``, neighbours nearly alike. This
+correlation makes a manipulated meter visible among its neighbours (docs/theory-sequential.md, section 1).
+
+The unknown part of the buses' squared voltages is w ~ N(0, S) with S from `voltage_prior`; a meter at bus b
+reads ``m = w_b + e``, ``e ~ N(0, d)``. For trusted meters T
 
     Q = (S_TT + D_TT)^-1                      precision of the readings, zero elsewhere
     w_hat = S_:T Q m_T                        posterior mean
@@ -24,20 +26,50 @@ and the chi-square falls by ``b^T Q_DD^-1 b`` with ``b = Q_D: m``, whatever m is
 
 Every row of F is one of the rank-one updates of `add_meter`.
 
+A suspect meter may report false powers: the active power of customer k is uniformly false within the size of
+its fault, the reactive power within half of that, with prior odds of one. With a the column of 2R times the
+standard deviation of a false power, the trusted meters give the Bayes factor
+
+    log B_k = (a_T^T Q m)^2 / (2 (1 + a_T^T Q a_T)) - log(1 + a_T^T Q a_T) / 2,
+
+and the variance of k's false power is that of a false one times ``B_k / (1 + B_k)``. A power that no trusted
+meter feels stays doubted; one that many feel without a contradiction is used again. With U the columns of 2R
+and 2X of all these customers, each times its standard deviation, the prior covariance is ``S + U U^T``, hence
+
+    C = U - S_:T Q U_T,   G = I + U_T^T Q U_T,
+    w' = w + C G^-1 U_T^T Q m,   M' = M + C G^-1 C^T.
+
+At the buses of trusted meters, with variances D of the readings, ``S_TT Q = I - D Q`` gives ``C = D Q U_T``.
+
+A voltage reading beside an unread power has no check of its own: each error within the load's range is a
+load. With w and M of all trusted meters, and w', M' of the vouched ones, the variance at every bus is
+
+    M' + (w - w')^2
+
+about w. It covers the truth if the other readings are false, and is M' plus little if they are true
+(docs/theory-sequential.md, section 7).
+
 References
 ----------
-Dubrule 1983 (leave-one-out by one inverse), the Schur complement otherwise; docs/theory-sequential.md.
+Dubrule 1983 (leave-one-out by one inverse), the Schur complement otherwise; Sherman, Morrison and Woodbury's
+identity; Mitchell and Beauchamp 1988 (spike and slab). Each customer is tested as if all other powers were
+true, and the mixture is replaced by the normal distribution of the same variance. docs/theory-sequential.md,
+section 7.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
 from scipy.linalg import blas, lapack
+from scipy.special import expit
 
-from gridsec.arrays import Bools, Floats, Ints, all_of, indices, submatrix
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices, submatrix
+from gridsec.errors import Problem, raise_if_any
+from gridsec.grid.devices import Droop, MeterAccuracy
+from gridsec.grid.network import Network, Power, Sensitivities
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -262,8 +294,12 @@ def _subtract_information(now: Posterior, at: Ints, inverse: Floats) -> None:
 
 MAX_NOISE_RATIO = 10.0
 """Ratio of noise to prior variance above which the shortcut at meters' buses loses more than one digit."""
+
+
 _ROWS = 256
 """Rows of one block of a product."""
+
+
 _LOWER = np.tri(_ROWS, dtype=np.bool_)
 
 
@@ -386,6 +422,8 @@ def _prior_column(now: Posterior, j: int) -> Floats:
 
 _COLUMN_COST = 8
 """Cost of selecting a column of a matrix, in rows of a product with it."""
+
+
 _LEAST_NOISE = 1e-6
 """Least ratio of noise to the largest prior variance for block updates; below it rounding dominates."""
 
@@ -529,3 +567,276 @@ class ExcludedMeters:
             between += now.unknowns[rows] @ now.unknowns[prior.meters[which]].T
         out[rows] = self.columns[np.ix_(rows, order)] - between @ seen
         return out
+
+
+# --- Prior ---
+
+
+EXACT = 1e-6
+"""Least standard deviation of a power, pu."""
+
+
+UNMETERED = 0.1
+"""Standard deviation of an unmetered squared busbar voltage, squared pu."""
+
+
+LONGEST_S = 1e12
+"""Longest correlation time of power errors, s: longer ones leave nothing to learn."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadDoubt:
+    """Uncertainty of the powers in the frames. N customers.
+
+    Attributes
+    ----------
+    p, q : (N,)
+        Standard deviations of the errors of active and reactive power, pu. Larger `p_error`, `q_error` of a
+        frame take precedence.
+    time_s
+        Correlation time of these errors, s; means over much less time contain all of them.
+    common_p, common_q
+        Shares of the variances common to all customers (weather, time of day), 0 to 1.
+    lasting
+        Share of the variances that no mean reduces, 0 to 1: a wrong power factor lasts for years.
+    together : (N,) or one for all
+        Share of both variances in phase with that of all others, 0 to 1: unmetered loads are low together by
+        night, active and reactive.
+    even_p, even_q : (N,)
+        Derived: half-widths of uniform errors with standard deviations p and q, pu.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite, negative, or a share outside [0, 1]; names every problem.
+    """
+
+    p: Floats
+    q: Floats
+    time_s: float
+    common_p: float = 0.0
+    common_q: float = 0.0
+    lasting: float = 0.0
+    together: Floats | float = 0.0
+    even_p: Floats = field(init=False, repr=False)
+    even_q: Floats = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        problems = [
+            Problem("negative", f"{name} must be finite and not negative")
+            for name in ("p", "q")
+            if not (np.isfinite(getattr(self, name)).all() and (getattr(self, name) >= 0).all())
+        ]
+        if not 0 < self.time_s <= LONGEST_S:
+            most = f"at most {LONGEST_S:g}; what never changes is `lasting`"
+            problems.append(
+                Problem("out-of-range", f"time_s is {self.time_s}; it must be positive and {most}")
+            )
+        problems += [
+            Problem("out-of-range", f"{name} is {getattr(self, name)}; it must be from 0 to 1")
+            for name in ("common_p", "common_q", "lasting", "together")
+            if not (np.greater_equal(getattr(self, name), 0) & np.less_equal(getattr(self, name), 1)).all()
+        ]
+        raise_if_any(problems)
+        for name, std in (("even_p", self.p), ("even_q", self.q)):
+            object.__setattr__(self, name, np.sqrt(3.0) * np.maximum(std, EXACT))
+
+
+def voltage_prior(
+    feeder: Network, at: Ints, doubt: LoadDoubt, *, busbar: Floats | float, inverters: Floats | None = None
+) -> Prior:
+    """Covariance of the buses' squared voltages without any meter.
+
+    ``S = 4 R V_p R^T + 4 X V_q X^T + u u^T + busbar^2 1 1^T`` with ``u = 2 R g s_p + 2 X g s_q``,
+    ``g^2 = together``, and for the rest, s being ``sqrt(1 - together) s``,
+    ``V = (1 - common) diag(s^2) + common s s^T``. In three phases places stand for buses, and only those of
+    one phase share the busbar's error.
+
+    at: (p,) bus of each meter. busbar: standard deviation of its squared voltage, squared pu; one or (3,).
+    inverters: (N,) standard deviation of the observed injections, pu.
+    """
+    alone, together = (np.sqrt(part) for part in (1.0 - doubt.together, doubt.together))
+    p, q = alone * doubt.p, alone * doubt.q
+    q = q if inverters is None else np.hypot(q, inverters)
+    variance = feeder.broadcast_busbar(busbar**2)
+    of_meters: Floats = np.repeat(variance[:, None], at.size, axis=1)
+    of_meters *= feeder.same_busbar_phase(np.arange(variance.size), at)
+    none = np.zeros_like(q)
+    for power, std, common, shared in (
+        (Power.ACTIVE, p, doubt.common_p, feeder.bus_voltages(p, none, 0.0, steps=0)),
+        (Power.REACTIVE, q, doubt.common_q, feeder.bus_voltages(none, q, 0.0, steps=0)),
+    ):
+        of_meters += feeder.covariance(power, at, (1.0 - common) * std**2)
+        variance += feeder.variances(power, (1.0 - common) * std**2)
+        if common:
+            of_meters += np.multiply.outer(common * shared, shared[at])
+            variance += common * shared**2
+    if np.any(together):
+        shared = feeder.bus_voltages(together * doubt.p, together * doubt.q, 0.0, steps=0)
+        of_meters += np.multiply.outer(shared, shared[at])
+        variance += shared**2
+    return Prior(of_meters, at, variance)
+
+
+def injection_doubt(droop: Droop, accuracy: MeterAccuracy, meters: Ints, customers: int) -> Floats:
+    """Standard deviation of the observed injections by the meters' own errors, (N,) in pu.
+
+    An inverter driven by its meter follows the fixed error of the reading through the steepest part of its
+    curve, at most up to saturation.
+    """
+    error = np.zeros(customers)
+    error[meters] = 2.0 * np.sqrt(
+        accuracy.class_fraction**2 / 3.0 + accuracy.resolution**2 / 12.0 + accuracy.jitter**2
+    )
+    own = np.minimum(droop.slope * error[droop.customer], droop.limit)
+    return np.asarray(np.sqrt(droop.per_customer(own**2, customers)))
+
+
+# --- False powers of suspects ---
+
+
+FALSE_Q = 0.5
+"""Largest reactive power per active power of a false report."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DoubtedPowers:
+    """Posterior with doubted powers. n buses, t trusted meters, l suspects."""
+
+    fit: Posterior  # posterior with all powers used
+    customers: Ints  # (l,) suspects' customers
+    sizes: Floats  # (l,) largest false active powers, pu
+    share: Floats  # (l,) used part of the standard deviation of a false power
+    effects: Floats  # (t, 2 l) effects of false powers at the trusted meters, active ones first
+    gram: Floats  # (2 l, 2 l) U_T^T Q U_T of whole standard deviations
+    C: Floats  # (n, 2 l) posterior covariance with such false powers
+    factor: Floats  # (2 l, 2 l) Cholesky factor of G for the used parts, lower triangle
+    variance: Floats  # (n,) diagonal of M'
+
+    def mean(self, loo: LeaveOneOut) -> Floats:
+        """w', (n,)."""
+        both = np.tile(self.share, 2)
+        along = both * (loo.weights[self.fit.trusted] @ self.effects)
+        amount, _ = lapack.dpotrs(self.factor, along, lower=True)
+        return np.asarray(loo.mean + self.C @ (both * amount))
+
+    def matches(self, fit: Posterior, customers: Ints, sizes: Floats) -> bool:
+        """True if `doubt_powers` would start from the same posterior, customers and sizes."""
+        same = fit is self.fit and np.array_equal(customers, self.customers)
+        return same and np.array_equal(sizes, self.sizes)
+
+    def is_current(self, loo: LeaveOneOut) -> bool:
+        """True if the used parts are close to those of the present residuals."""
+        share = _share(self.effects, self.gram, loo.weights[self.fit.trusted])
+        return all_of((share <= _MORE * self.share) & (share >= _LESS * self.share))
+
+    def renewed(self, loo: LeaveOneOut) -> DoubtedPowers:
+        """The same with the parts of the present residuals."""
+        share = _share(self.effects, self.gram, loo.weights[self.fit.trusted])
+        factor, variance = _factorised(self.fit, self.gram, self.C, share)
+        return replace(self, share=share, factor=factor, variance=variance)
+
+
+_MORE, _LESS, _LEAST_SHARE = 1.25, 0.5, 0.125
+"""Range of parts that are reused, as ratios to the wanted ones, and the least part."""
+
+
+def doubt_powers(
+    sensitivities: Sensitivities, fit: Posterior, customers: Ints, sizes: Floats, loo: LeaveOneOut
+) -> DoubtedPowers:
+    """Doubt the powers of customers (l,) by at most `sizes` (l,), pu; O(n p l)."""
+    prior, (at, inverse), std = fit.prior, fit.precision(), sizes / np.sqrt(3.0)
+    U = np.empty((prior.variance.size, 2 * sizes.size))
+    U[:, : sizes.size] = sensitivities.columns(Power.ACTIVE, customers) * std
+    U[:, sizes.size :] = sensitivities.columns(Power.REACTIVE, customers) * (FALSE_Q * std)
+    seen = U[prior.meters[at]]
+    known = inverse @ seen
+    gram = seen.T @ known
+    _conditioned(fit, U, known)
+    share = _share(seen, gram, loo.weights[at])
+    return DoubtedPowers(fit, customers, sizes, share, seen, gram, U, *_factorised(fit, gram, U, share))
+
+
+def _factorised(fit: Posterior, gram: Floats, C: Floats, share: Floats) -> tuple[Floats, Floats]:
+    """Cholesky factor of G and diagonal of M' for powers false by parts of their sizes."""
+    both = np.tile(share, 2)
+    G = gram * np.multiply.outer(both, both)
+    G[np.diag_indices(both.size)] += 1.0
+    # Symmetric: the transpose is the same in the order of LAPACK.
+    factor, failed = lapack.dpotrf(G.T, lower=True, clean=False, overwrite_a=True)
+    if failed:
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    variance = fit.variance.copy()
+    for first in range(0, len(C), _ROWS):
+        rows = slice(first, first + _ROWS)
+        half, _ = lapack.dtrtrs(factor, (C[rows] * both).T, lower=True, overwrite_b=True)
+        variance[rows] += np.einsum("ij,ij->j", half, half)
+    return factor, variance
+
+
+def _conditioned(fit: Posterior, U: Floats, known: Floats) -> None:
+    """Replace U by C in place, in blocks of rows."""
+    prior, at = fit.prior, indices(fit.trusted)
+    buses, left = prior.meters[at], np.ones(len(U), dtype=np.bool_)
+    left[buses] = False
+    others, loose = indices(left), fit.unknowns[buses].T @ known
+    for first in range(0, others.size, _ROWS):
+        rows = others[first : first + _ROWS]
+        U[rows] -= submatrix(prior.covariance, rows, at) @ known + fit.unknowns[rows] @ loose
+    U[buses] = fit.noise[at, None] * known
+
+
+def _share(seen: Floats, gram: Floats, weights: Floats) -> Floats:
+    """Root of the probability that each power is false, (l,)."""
+    count = len(gram) // 2
+    form, along = gram.diagonal()[:count], weights @ seen[:, :count]
+    odds = 0.5 * (along**2 / (1.0 + form) - np.log1p(form))
+    return np.asarray(np.maximum(np.sqrt(expit(odds)), _LEAST_SHARE))
+
+
+# --- Withheld powers ---
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VouchedPosterior:
+    """Posterior without some meters. p meters."""
+
+    whole: Posterior  # posterior with them
+    removed: Bools  # (p,) trusted meters without a check
+    vouched: Posterior  # posterior without them
+
+    def added_variance(self, loo: LeaveOneOut) -> Floats:
+        """Variance to be added to the posterior with all meters, (n,), squared pu^2."""
+        moved = loo.mean - leave_one_out(self.vouched, loo.m).mean
+        return np.asarray(np.maximum(self.vouched.variance - self.whole.variance, 0.0) + moved**2)
+
+
+def vouched_posteriors(
+    before: tuple[VouchedPosterior | None, ...],
+    posteriors: tuple[Posterior | None, ...],
+    vouched: Bools,
+) -> tuple[VouchedPosterior | None, ...]:
+    """Posteriors without meters that are not vouched, by scale; None where all are. `before` is reused."""
+    if all_of(vouched):
+        return before if not any(before) else (None,) * len(posteriors)
+    pairs = zip(before, posteriors, vouched, strict=True)
+    return tuple(None if now is None else _reused(kept, now, vouched) for kept, now, vouched in pairs)
+
+
+def _reused(kept: VouchedPosterior | None, now: Posterior, vouched: Bools) -> VouchedPosterior | None:
+    removed = now.trusted & ~vouched
+    if kept is not None and kept.whole is now and np.array_equal(kept.removed, removed):
+        return kept
+    return vouched_posterior(now, vouched)
+
+
+def vouched_posterior(now: Posterior, vouched: Bools) -> VouchedPosterior | None:
+    """Posterior without meters that are not vouched (p,); None if all are."""
+    removed = now.trusted & ~vouched
+    if not any_of(removed):
+        return None
+    if well_conditioned(now.prior, now.noise):
+        return VouchedPosterior(now, removed, remove_meters(now, removed))
+    return VouchedPosterior(
+        now, removed, condition(now.prior, now.noise, now.trusted & ~removed, now.unknowns)
+    )

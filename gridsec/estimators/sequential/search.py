@@ -1,4 +1,12 @@
-"""Search for the likeliest set of manipulated meters, without swamping honest or masking manipulated ones.
+"""Search for the likeliest set of manipulated meters and faults, without swamping honest or masking others.
+
+A fault is a direction of the voltages: a wrong power or inverter. An unknown amplitude of direction a with
+standard deviation s lowers the chi-square ``m^T Q m`` by
+
+    (a^T Q m)^2 / (1 / s^2 + a^T Q a),
+
+removing meter j as well by ``g^T G^-1 g`` with g and G the weights and the precision of both. A manipulated
+voltage may come with false powers of the same customer, so the pair is one move.
 
 A hypothesis removes some meters and accuses some directions of the fault dictionary. Its cost is
 
@@ -8,9 +16,9 @@ up to a constant minus twice the logarithm of its posterior probability, if ever
 meters is equally likely, and every set of k among those of k. Each of many accusations is thus cheaper than a
 single one.
 
-Removing trusted meter j lowers the chi-square by ``residual_j^2 / std_j^2``, an unknown amplitude of
-direction a by ``(a^T Q m)^2 / (1 / std_a^2 + a^T Q a)``; adding a meter raises it likewise. Steepest descent
-therefore needs no refitting. It removes and adds meters with residuals beyond, or back within, the limits.
+Removing trusted meter j lowers the chi-square by ``residual_j^2 / std_j^2``; adding a meter raises it
+likewise. Steepest descent therefore needs no refitting. It removes and adds meters with residuals beyond, or
+back within, the limits.
 
 Descent alone swamps where many meters are off alike: their neighbours look wrong. It therefore starts from
 the set trusted before and from a robust one; the cheaper hypothesis wins. With the readings m, their
@@ -45,7 +53,6 @@ import numpy as np
 from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, frozen_ints, indices, submatrix
-from gridsec.estimators.sequential.fault_dictionary import FaultDictionary, FaultGains, Move
 from gridsec.estimators.sequential.posterior import (
     ExcludedMeters,
     LeaveOneOut,
@@ -53,6 +60,7 @@ from gridsec.estimators.sequential.posterior import (
     Prior,
     RankOneUpdate,
     add_meter,
+    add_unknown,
     leave_one_out,
     remove_meter,
     remove_meters,
@@ -60,6 +68,137 @@ from gridsec.estimators.sequential.posterior import (
     updated,
     well_conditioned,
 )
+
+# --- Directions of possible faults ---
+
+
+_SUSPECT_CHARGE, _FEW_SUSPECTS, _LEAST_CHARGE = 2.0, 3, 0.5
+"""Charge of a suspect's false power: up to `_FEW_SUSPECTS` suspects, and least, in accusations."""
+
+
+def false_power_charge(suspects: int) -> float:
+    """Charge for the false power of a suspect meter's customer, in accusations of a meter.
+
+    The charge is 2 up to three suspects, then inversely proportional to their number, at least 0.5. Among
+    many suspects a high charge would accuse honest neighbours instead.
+    """
+    return max(_SUSPECT_CHARGE * min(1.0, _FEW_SUSPECTS / max(suspects, 1)), _LEAST_CHARGE)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaultDictionary:
+    """Directions of possible faults. n buses, p meters, k directions."""
+
+    std: Floats  # (k,) standard deviation of each amplitude, pu
+    charge: Floats  # (k,) cost of accusing it, in accusations of a meter
+    size: Floats  # (k,) sum over the meters of its squared changes
+    meter: Ints  # (k,) meter of its customer, charged at most `false_power_charge` as a suspect; -1 for none
+    columns: Callable[[Ints], Floats]  # `columns(which)`: changes of every squared voltage per unit, (n, …)
+    weighted: Callable[[Floats], Floats]  # `along(weights)`: weighted sum of its changes at the meters, (k,)
+
+    def charges(self, which: Ints, trusted: Bools, suspects: int) -> Floats:
+        """Cost of accusing directions (c,), in accusations of a meter; suspects: number of suspect meters."""
+        charge, own = self.charge[which], self.beside_suspect(which, trusted)
+        return np.where(own, np.minimum(charge, false_power_charge(suspects)), charge)
+
+    def beside_suspect(self, which: Ints, trusted: Bools) -> Bools:
+        """Directions (c,) that are the power of a customer with a suspect meter, (c,)."""
+        return np.asarray((self.meter[which] >= 0) & ~trusted[self.meter[which]])
+
+    def reduced(self) -> FaultDictionary:
+        """Fault dictionary with reduced charges, for searching alternative explanations."""
+        return replace(self, charge=np.minimum(self.charge, _SUSPECT_CHARGE))
+
+
+_CANDIDATES = 64
+"""Directions that a search tries, those of the largest gradient."""
+
+
+_LEAST_SIZE = 1e-6
+
+
+Move = Callable[[], RankOneUpdate]
+"""Changes a posterior when called."""
+
+
+class FaultGains:
+    """Gains of the directions during a search: Q A follows Q by rank one, diag(A^T Q A) by squares.
+
+    The moves of the search change the posterior `now`. weights: (p,) Q m. available: (p,) meters with a
+    reading. protected: (k,) meters that stay trusted.
+    """
+
+    def __init__(
+        self, now: Posterior, dictionary: FaultDictionary, weights: Floats, available: Bools, protected: Ints
+    ) -> None:
+        towards = dictionary.weighted(weights) ** 2 / np.maximum(dictionary.size, _LEAST_SIZE)
+        self.faults, self.now, self.available = dictionary, now, available
+        self.index = (-towards).argsort()[:_CANDIDATES]
+        self.columns = dictionary.columns(self.index)
+        self.at_meters = self.columns[now.prior.meters]
+        self.std, self.meter = dictionary.std[self.index], dictionary.meter[self.index]
+        at, Q = now.precision()
+        at_meters = self.at_meters[at]
+        self.spread = np.zeros_like(self.at_meters)
+        self.spread[at] = spread = Q @ at_meters
+        self.form = np.einsum("ij,ij->j", spread, at_meters)
+        self.protected = np.isin(self.meter, protected) if protected.size else None
+        self.accused: list[int] = []
+
+    @property
+    def accused_faults(self) -> tuple[int, ...]:
+        """Accused directions, indices of the dictionary."""
+        return tuple(self.index[self.accused].tolist())
+
+    def best_move(self, loo: LeaveOneOut, penalty: float, than: float) -> list[Move]:
+        """Steps of the best direction, alone or with its meter removed, if it gains more than `than`.
+
+        penalty: least gain of an accusation.
+        """
+        trusted = self.now.trusted
+        suspects = int(np.count_nonzero(self.available & ~trusted))
+        alone = self._gains(loo.weights) - penalty * self.faults.charges(self.index, trusted, suspects)
+        both = self._gains_with_meter(loo.weights) - penalty * (1.0 + false_power_charge(suspects))
+        if self.protected is not None:
+            both[self.protected] = -np.inf
+        alone[self.accused] = both[self.accused] = -np.inf
+        k, pair = int(alone.argmax()), int(both.argmax())
+        if max(alone[k], both[pair]) <= than:
+            return []
+        if alone[k] >= both[pair]:
+            return [lambda: self._accuse(k)]
+        return [
+            lambda: self._accuse(pair),
+            lambda: self.update(remove_meter(self.now, int(self.meter[pair]))),
+        ]
+
+    def update(self, update: RankOneUpdate) -> RankOneUpdate:
+        """Update the gains after a change of the posterior."""
+        along = update.q @ self.at_meters
+        self.spread += np.multiply.outer(update.factor * update.q, along)
+        self.form += update.factor * along**2
+        return update
+
+    def _gains(self, weights: Floats) -> Floats:
+        """Fall of the chi-square by each direction, (k,)."""
+        return np.asarray((weights @ self.at_meters) ** 2 / (self.std**-2.0 + self.form))
+
+    def _gains_with_meter(self, weights: Floats) -> Floats:
+        """The same with its meter removed, (k,); -inf without a trusted meter."""
+        at = self.meter
+        a, b = self.std**-2.0 + self.form, self.now.diagonal()[at]
+        c = self.spread[at, np.arange(at.size)]
+        u, v = weights @ self.at_meters, weights[at]
+        free = (at >= 0) & self.now.trusted[at]
+        determinant = np.where(free, a * b - c * c, 1.0)
+        return np.where(free, (b * u * u - 2.0 * c * u * v + a * v * v) / determinant, -np.inf)
+
+    def _accuse(self, k: int) -> RankOneUpdate:
+        self.accused.append(k)
+        return self.update(add_unknown(self.now, self.columns[:, k], float(self.std[k])))
+
+
+# --- Descent ---
 
 
 class LimitCache:
@@ -154,6 +293,8 @@ def merged(one: Candidates | None, other: Candidates) -> Candidates:
 
 
 NO_METERS = frozen_ints(np.zeros(0, dtype=np.intp))
+
+
 _MOVES_PER_METER = 4
 """Largest number of moves of a descent per meter."""
 
@@ -406,10 +547,16 @@ def _noted(update: RankOneUpdate, gains: FaultGains | None) -> RankOneUpdate:
 
 _HARDENING = 2.5
 """Factor on the hardness of the cost from round to round."""
+
+
 _ROBUST_ROUNDS = 30
 """Largest number of rounds."""
+
+
 _LEAST_WEIGHT = 1e-6
 """Weights up to this count as zero, well above the rounding of Cholesky."""
+
+
 _TINY = float(np.finfo(np.float64).tiny)
 
 

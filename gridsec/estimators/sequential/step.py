@@ -7,21 +7,27 @@ from dataclasses import replace
 import numpy as np
 
 from gridsec.arrays import Floats, Ints, all_of, any_of, changed
-from gridsec.estimators.inputs import nothing_new
+from gridsec.estimators.plant import nothing_new
 from gridsec.estimators.sequential.attack_kind import AttackKinds, classify, ingest, repeat_lags
-from gridsec.estimators.sequential.busbar_meter import HonestErrors
-from gridsec.estimators.sequential.clock_offsets import ClockSkew, update_skew, without_shifted_busbar
-from gridsec.estimators.sequential.confirmation import confirm, supported
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.frame_uncertainty import FrameUncertainty, update_uncertainty
-from gridsec.estimators.sequential.identify import Identification, ended, identify
-from gridsec.estimators.sequential.inverter_check import (
+from gridsec.estimators.sequential.device_checks import (
     LONGEST_MEAN,
+    HonestErrors,
     InverterChecks,
     ReportedPowers,
     check_inverters,
 )
-from gridsec.estimators.sequential.measurements import Measurements, measurements, plausible
+from gridsec.estimators.sequential.identify import Identification, confirm, ended, identify, supported
+from gridsec.estimators.sequential.measurements import (
+    ClockSkew,
+    FrameUncertainty,
+    Measurements,
+    measurements,
+    plausible,
+    update_skew,
+    update_uncertainty,
+    without_shifted_busbar,
+)
 from gridsec.estimators.sequential.meter_bias import (
     Learning,
     LearningTick,
@@ -33,13 +39,14 @@ from gridsec.estimators.sequential.meter_bias import (
 from gridsec.estimators.sequential.observer import Prediction, model_error, predict, prepare
 from gridsec.estimators.sequential.output import output
 from gridsec.estimators.sequential.posterior import Posterior
-from gridsec.estimators.sequential.state import SequentialState
+from gridsec.estimators.sequential.state import SequentialState, TrustState
 from gridsec.estimators.sequential.time_scales import Scales, Window, empty, forget, min_readings, push, shift
-from gridsec.estimators.sequential.trust import TrustState
 from gridsec.interface import Estimate, Explanation, Frame, Verdict
 
 _PAUSE = 60.0
 """Ticks without a frame that count as a pause."""
+
+
 _RENEW_TICKS, _RENEW_RATIO, _LEAST_SWING = 16, 1.1, 0.01
 """Renewal of the model error: ticks, ratio of the largest voltage change, and least change, squared pu."""
 
@@ -55,7 +62,7 @@ def step(
         return state, *_repeated(design, state, frame)
     state, frame = _without_shifted_busbar(design, state, plausible(design, frame))
     while True:
-        measured = measurements(design, state, frame)
+        measured = measurements(design, frame, state.trust.trusted, state.busbar.trusted, state.v0_squared)
         uncertainty = update_uncertainty(
             design, state.uncertainty, frame, measured.available, measured.busbar_metered
         )
@@ -249,7 +256,7 @@ def _checked_inverters(
     trusted = measured.available & identified.trust.trusted & (identified.trust.ticks_suspect == 0)
     s = max(sum(length <= LONGEST_MEAN for length in design.lengths) - 1, 0)
     test, posterior = identified.tests[s], identified.posteriors[s]
-    loo, error = None if test is None else test.loo, predicted.injection_error
+    loo, error = None if test is None else test.loo, predicted.injection_error.error
     frame, reports_q, uses_q = measured.frame, measured.reports_q, measured.uses_q
     now = ReportedPowers(frame, reports_q, uses_q, trusted, predicted.x, error, posterior, loo)
     return check_inverters(design, before, now)

@@ -24,10 +24,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices
-from gridsec.estimators.sequential.clock_offsets import ClockSkew
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.fault_dictionary import FaultDictionary
-from gridsec.estimators.sequential.frame_uncertainty import FrameUncertainty
+from gridsec.estimators.sequential.measurements import ClockSkew, FrameUncertainty
 from gridsec.estimators.sequential.meter_bias import Learned
 from gridsec.estimators.sequential.posterior import (
     LeaveOneOut,
@@ -39,7 +37,7 @@ from gridsec.estimators.sequential.posterior import (
     remove_meters,
     well_conditioned,
 )
-from gridsec.estimators.sequential.search import Limits
+from gridsec.estimators.sequential.search import FaultDictionary, Limits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,8 +124,12 @@ class ScaleTest:
 
 _REFACTORISE = 6
 """A posterior is factorised again when more than one in `_REFACTORISE` of its meters changed."""
+
+
 _BLOCK_REMOVAL = 3
 """Fewer than one in `_BLOCK_REMOVAL` meters leave a fresh posterior by one block update instead."""
+
+
 _MAX_UPDATES = 400
 """Largest number of rank-one updates since a factorisation (rounding)."""
 

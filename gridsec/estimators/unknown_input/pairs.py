@@ -38,7 +38,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible
-from gridsec.estimators.thresholds import ErrorModel, largest
+from gridsec.estimators.detection import ErrorModel, largest
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -29,23 +29,21 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, frozen
 from gridsec.errors import NotObservable, Problem
-from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, no_counts
-from gridsec.estimators.inputs import (
+from gridsec.estimators.detection import Counters, DecisionInputs, count, decide, no_counts
+from gridsec.estimators.plant import (
     NO_VOLTAGE,
+    EstimatorContext,
     Inputs,
+    Options,
+    Plant,
     PreviousStep,
     busbar_errors,
+    check_plant,
     clean,
+    estimator_context,
     known,
     nothing_new,
     reconstruct,
-)
-from gridsec.estimators.plant import (
-    EstimatorContext,
-    Options,
-    Plant,
-    check_plant,
-    estimator_context,
     usual_options,
 )
 from gridsec.estimators.unknown_input.pairs import (

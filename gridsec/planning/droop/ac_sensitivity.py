@@ -26,10 +26,10 @@ from gridsec.arrays import Floats, Ints
 from gridsec.errors import DesignInfeasible
 from gridsec.grid import AnyNetwork
 from gridsec.grid.meshed import MeshedFeeder, PhasedMesh
+from gridsec.grid.network import below, from_root
 from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.radial import Feeder, common_paths
 from gridsec.grid.three_phase import ROTATION
-from gridsec.grid.trees import below, from_root
 
 __all__ = [
     "Complex",

@@ -12,7 +12,7 @@ import numpy as np
 
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible
-from gridsec.grid.droop import Droop, voltage_curve
+from gridsec.grid.devices import Droop, voltage_curve
 from gridsec.planning.droop.ac_sensitivity import (
     Complex,
     InjectionBox,

@@ -21,7 +21,7 @@ from scipy.linalg import LinAlgError, solve_continuous_are, solve_discrete_are
 
 from gridsec.arrays import Floats, Ints, spectral_radius
 from gridsec.errors import InputInvalid, Problem
-from gridsec.grid.droop import Droop, voltage_curve
+from gridsec.grid.devices import Droop, voltage_curve
 from gridsec.planning.droop.ac_sensitivity import Complex, InjectionBox, PhasorNetwork, Region, region
 
 __all__ = [

@@ -14,10 +14,9 @@ from feeders.convert.convert import check_against_source, convert
 from feeders.convert.round_trip import BALANCED_PU
 from feeders.format.tables import read
 from feeders.model.site import load
-from feeders.registry.registry import design
+from feeders.registry import design
 from feeders.simulation.attacks import AttackKind, AttackSpec
-from feeders.simulation.powerflow import PowerFlow
-from feeders.simulation.powerflow_three_phase import power_flow
+from feeders.simulation.powerflow import PowerFlow, power_flow
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, judge
 from gridsec.errors import FeederInvalid
 from gridsec.grid.meshed import MeshedFeeder, PhasedMesh

@@ -14,7 +14,7 @@ from feeders.convert.provenance import BusbarUnclear, SourceUnreadable
 from feeders.convert.round_trip import BALANCED_PU, UNBALANCED_PU
 from feeders.format.tables import examine, read, write
 from feeders.model.site import from_tables, load
-from feeders.registry.registry import design
+from feeders.registry import design
 from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.trial import LoadError, Trial, judge
 from feeders.simulation.trial import TrialMeterErrors as Quality

@@ -20,8 +20,7 @@ from feeders.convert.round_trip import BALANCED_PU, UNBALANCED_PU, SourceCheck, 
 from feeders.convert.transformers import Extent
 from feeders.format.tables import read, write
 from feeders.model.three_phase import three_phase
-from feeders.simulation.powerflow import PowerFlowDiverged
-from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow
+from feeders.simulation.powerflow import PowerFlowDiverged, UnbalancedPowerFlow
 from gridsec.errors import FeederInvalid, GridsecError
 from tests.codes import refused
 from tests.feeders.foreign import pgm

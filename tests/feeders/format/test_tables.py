@@ -52,11 +52,11 @@ from feeders.format.tables import (
     validate,
     write,
 )
-from feeders.format.topology import Edge, tree
+from feeders.format.validation import Edge, tree
 from feeders.model.site import find, load
 from feeders.profiles import load_names, pv_names
 from gridsec.errors import FeederInvalid
-from gridsec.grid.droop import PRESETS
+from gridsec.grid.devices import PRESETS
 from tests.codes import codes_of
 
 CASES = Path(__file__).parents[2] / "cases"
@@ -439,7 +439,7 @@ def test_any_flipped_byte_of_a_file_is_reported_or_harmless(
 
 def test_oversized_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(read(CASES / "good" / "three-customers"), tmp_path)
-    monkeypatch.setattr("feeders.format.reader.MAX_BYTES", 100)
+    monkeypatch.setattr("feeders.format.columns.MAX_BYTES", 100)
     problems = validate(tmp_path)
     assert any((each.code, each.partition(": ")[0]) == ("too-many", "feeder.toml") for each in problems)
 

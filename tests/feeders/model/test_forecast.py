@@ -13,10 +13,20 @@ from hypothesis import strategies as st
 
 from feeders.format.tables import read, to_json, write
 from feeders.model.forecast import season_of
-from feeders.model.load_uncertainty import forecast_errors, from_history, load_doubt, tell, unread
-from feeders.model.site import Site, Snapshot, from_tables, load, to_frame
+from feeders.model.site import (
+    Site,
+    Snapshot,
+    forecast_errors,
+    from_history,
+    from_tables,
+    load,
+    load_doubt,
+    tell,
+    to_frame,
+    unread,
+)
 from feeders.profiles import Season, library
-from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.registry import SEQUENTIAL, DesignedEstimator, choose, design
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from feeders.simulation.trial import Trial, frames
 from feeders.studies.campaign.guarantees import Rehearsal, rehearse
@@ -24,7 +34,7 @@ from feeders.studies.detectable import detectable
 from feeders.studies.operating import box
 from gridsec.arrays import Floats
 from gridsec.errors import InputInvalid
-from gridsec.estimators.inputs import usual
+from gridsec.estimators.plant import usual
 from gridsec.estimators.sequential import SequentialDesign, SequentialState
 from tests.codes import refused
 from tests.feeders.unmetered import CIGRE, unmetered, without

@@ -8,8 +8,17 @@ import numpy as np
 import pytest
 
 from benchmarks.late_powers import run, unchanged
-from feeders.model.load_uncertainty import load_doubt
-from feeders.model.site import SWITCHED, PowerAges, Site, Snapshot, from_tables, late, load, to_frame
+from feeders.model.site import (
+    SWITCHED,
+    PowerAges,
+    Site,
+    Snapshot,
+    from_tables,
+    late,
+    load,
+    load_doubt,
+    to_frame,
+)
 from gridsec.estimators.sequential.design import SequentialOptions
 from gridsec.interface import PowerOrigin
 from tests.feeders.model.test_forecast import forecasting

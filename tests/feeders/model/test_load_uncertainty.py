@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from feeders.format.tables import write
-from feeders.model.load_uncertainty import ALIKE, from_history, load_doubt, tell, unread
-from feeders.model.site import Site, from_tables, load, names
-from feeders.registry.registry import design
+from feeders.model.site import ALIKE, Site, from_history, from_tables, load, load_doubt, names, tell, unread
+from feeders.registry import design
 from feeders.simulation.scenario import START
 from gridsec.errors import InputInvalid
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialState
-from gridsec.estimators.sequential.load_uncertainty import prior
+from gridsec.estimators.sequential.posterior import voltage_prior
 from tests.codes import refused
 from tests.feeders.unmetered import CIGRE, played, unmetered
 
@@ -88,7 +87,7 @@ def test_what_goes_up_and_down_together_moves_voltages_together() -> None:
         ]
     )
     w = roots @ np.hstack([2.0 * model.R_bus, 2.0 * model.X_bus]).T
-    found = prior(feeder, feeder.bus, doubt, busbar=0.0)
+    found = voltage_prior(feeder, feeder.bus, doubt, busbar=0.0)
     np.testing.assert_allclose(found.covariance, (w.T @ w)[:, feeder.bus], atol=1e-12)
     np.testing.assert_allclose(found.variance, np.diag(w.T @ w), atol=1e-12)
     with refused(InputInvalid, "out-of-range"):

@@ -14,10 +14,9 @@ from hypothesis import given, settings
 from benchmarks.mesh import baran_wu, closed, landnetz, rural3
 from feeders.format.tables import LineRow, examine, read, validate, write
 from feeders.model.site import Site, from_tables, load
-from feeders.registry.registry import choose, design
+from feeders.registry import choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec
-from feeders.simulation.powerflow import PowerFlow
-from feeders.simulation.powerflow_three_phase import power_flow
+from feeders.simulation.powerflow import PowerFlow, power_flow
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, TrialResult, judge
 from feeders.studies.detectable import detectable
 from feeders.studies.redundancy import redundancy

@@ -15,9 +15,9 @@ from benchmarks.mesh import closed, european, landnetz, sensitivity
 from feeders.format.tables import FeederTables, LineRow, examine, read, validate, write
 from feeders.model.site import Site, from_tables, load
 from feeders.model.three_phase import three_phase
-from feeders.registry.registry import choose, design
+from feeders.registry import choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec
-from feeders.simulation.powerflow_three_phase import PlacesFlow, power_flow
+from feeders.simulation.powerflow import PlacesFlow, power_flow
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, TrialResult, judge
 from feeders.studies.calibrate.feeder import network
 from feeders.studies.detectable import detectable

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import Site, Snapshot, load, to_frame
-from feeders.registry.registry import DesignedEstimator, design
+from feeders.registry import DesignedEstimator, design
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.arrays import Floats
 from gridsec.interface import Frame, PowerOrigin

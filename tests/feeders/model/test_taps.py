@@ -13,14 +13,12 @@ from feeders.format.tables import FeederTables, LineRow, from_json, to_json, val
 from feeders.model.site import Site, Snapshot, from_tables, load, to_frame, volts
 from feeders.model.three_phase import three_phase
 from feeders.simulation.attacks import fake_load
-from feeders.simulation.meters import Channel, MeterErrors, SimulatedMeters
-from feeders.simulation.plant import ClosedLoop, Loads
-from feeders.simulation.powerflow import Grid, PowerFlow
-from feeders.simulation.powerflow_three_phase import PlacesFlow, UnbalancedPowerFlow, power_flow
+from feeders.simulation.plant import Channel, ClosedLoop, Loads, MeterErrors, SimulatedMeters
+from feeders.simulation.powerflow import Grid, PlacesFlow, PowerFlow, UnbalancedPowerFlow, power_flow
 from feeders.studies.detectable import detectable
 from feeders.studies.protect import Goal, protect
 from gridsec.errors import FeederInvalid
-from gridsec.grid.droop import preset
+from gridsec.grid.devices import preset
 from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.three_phase import bus_voltages as phase_voltages
 from gridsec.grid.three_phase import model_error_bound as phase_error_bound

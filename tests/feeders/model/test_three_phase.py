@@ -12,7 +12,7 @@ from feeders.format.columns import PAIRS
 from feeders.format.tables import FeederTables, LineRow, examine, from_json, read, to_json
 from feeders.model.site import find, from_tables, load
 from feeders.model.three_phase import ThreePhaseSite, load_three_phase, three_phase, three_phase_names
-from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow
+from feeders.simulation.powerflow import UnbalancedPowerFlow
 from feeders.studies.calibrate.search import longer
 from gridsec.arrays import Floats, Phasors
 from gridsec.errors import FeederInvalid

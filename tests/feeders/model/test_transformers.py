@@ -15,11 +15,10 @@ from feeders.format.tables import FeederTables, LineRow, from_json, read, to_jso
 from feeders.model.site import Site, Snapshot, from_tables, to_frame, volts
 from feeders.model.three_phase import three_phase
 from feeders.simulation.plant import ClosedLoop, Loads
-from feeders.simulation.powerflow import PowerFlow
-from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow, power_flow
+from feeders.simulation.powerflow import PowerFlow, UnbalancedPowerFlow, power_flow
 from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid
-from gridsec.grid.droop import preset
+from gridsec.grid.devices import preset
 from tests.feeders import stations
 from tests.feeders.stations import LV, MV
 

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from feeders.model.load_uncertainty import load_doubt
-from feeders.model.site import Site, Snapshot, from_tables, load, names, plant, to_frame
+from feeders.model.site import Site, Snapshot, from_tables, load, load_doubt, names, plant, to_frame
 from feeders.simulation.plant import ClosedLoop, Loads, Point
 from feeders.simulation.powerflow import PowerFlow
 from gridsec.estimators import exact_bank, sequential

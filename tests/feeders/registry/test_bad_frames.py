@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import load, to_frame
-from feeders.registry.registry import FAMILIES, DesignedEstimator, choose, design
+from feeders.registry import FAMILIES, DesignedEstimator, choose, design
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.interface import Decision, Frame
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from feeders.registry.design_cache import BankGains, DesignCache, bank_gains, folder
+from feeders.registry import BankGains, DesignCache, bank_gains, cache_folder
 from gridsec.errors import InputInvalid, NotObservable
 from gridsec.estimators.exact_bank import bank
 from gridsec.observers.gains import margin, options_for
@@ -38,7 +38,7 @@ def run(where: Path, seen: list[tuple[int, int]] | None = None) -> BankGains:
     ],
 )
 def test_where_designs_are_kept(environment: dict[str, str], platform: str, expected: str) -> None:
-    assert folder(environment, platform).as_posix() == expected
+    assert cache_folder(environment, platform).as_posix() == expected
 
 
 def test_the_default_folder_follows_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

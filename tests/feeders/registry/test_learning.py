@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import from_tables, load
-from feeders.registry.registry import SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.registry import SEQUENTIAL, DesignedEstimator, choose, design
 from gridsec.estimators.sequential.meter_bias import class_only, learn, no_readings, ready_meters
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks._stealthy import linear_tests, misfit_limit, within_misfit
 from feeders.model.site import Site, Snapshot, from_tables, load, to_frame
-from feeders.registry.registry import DesignedEstimator, design
+from feeders.registry import DesignedEstimator, design
 from feeders.simulation.demand import Variation
 from feeders.simulation.scenario import START, Scenario, SimulatedTick, simulate, snapshots
 from gridsec.arrays import Bools, Floats

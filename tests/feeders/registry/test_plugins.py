@@ -10,16 +10,15 @@ from pathlib import Path
 
 import pytest
 
+from feeders import registry
 from feeders.format.columns import ESTIMATORS, OWN_ESTIMATORS, foreign_estimators
 from feeders.model.site import Site, load
-from feeders.registry import plugins, registry
-from feeders.registry.plugins import EstimatorUnusable
-from feeders.registry.registry import DesignOptions, Estimator, Families
+from feeders.registry import DesignOptions, Estimator, EstimatorUnusable, Families
 from gridsec.errors import DesignInfeasible, FeederInvalid, NotObservable
 from tests.codes import refused
 
 GOOD = """
-from feeders.registry.registry import Estimator
+from feeders.registry import Estimator
 
 print("loaded")
 FAMILY = Estimator(
@@ -40,7 +39,7 @@ def install(place: Path, package: str, code: str, *points: str) -> None:
     about = place / f"{package}-1.0.dist-info"
     about.mkdir()
     (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text("\n".join([f"[{plugins.GROUP}]", *points, ""]))
+    (about / "entry_points.txt").write_text("\n".join([f"[{registry.GROUP}]", *points, ""]))
     importlib.invalidate_caches()
 
 
@@ -79,7 +78,7 @@ def test_what_cannot_be_used_is_refused_by_name(place: Path) -> None:
         ("nobody", "0 packages offer it"),
     ):
         with refused(EstimatorUnusable, "estimator-unusable") as caught:
-            plugins.load(name, Estimator)
+            registry.load_foreign(name, Estimator)
         assert why in str(caught.value)
 
 
@@ -92,14 +91,14 @@ def test_what_a_design_says_on_purpose_is_passed_on_and_all_else_is_one_line() -
 
         return design
 
-    assert plugins.design("mine", lambda site, job: (site, job), site, job) == (site, job)
+    assert registry.design_foreign("mine", lambda site, job: (site, job), site, job) == (site, job)
     for known in (NotObservable((0,), 1, "too few"), DesignInfeasible("design", "not found")):
         with pytest.raises(type(known)) as told:
-            plugins.design("mine", failing(known), site, job)
+            registry.design_foreign("mine", failing(known), site, job)
         assert told.value is known
     for other in (FeederInvalid(["of two", "reasons"]), KeyError("x"), MemoryError()):
         with refused(EstimatorUnusable, "estimator-unusable") as told:
-            plugins.design("mine", failing(other), site, job)
+            registry.design_foreign("mine", failing(other), site, job)
         assert type(other).__name__ in str(told.value)
         assert "\n" not in str(told.value)
         assert told.value.__cause__ is other

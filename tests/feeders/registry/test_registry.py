@@ -10,7 +10,7 @@ import pytest
 
 from feeders.format.columns import ESTIMATORS
 from feeders.model.site import from_tables, load, to_frame
-from feeders.registry.registry import DIRECT, FAMILIES, LMI, SEQUENTIAL, choose, design, lmi_options
+from feeders.registry import DIRECT, FAMILIES, LMI, SEQUENTIAL, choose, design, lmi_options
 from feeders.simulation.powerflow import PowerFlow
 from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
 from gridsec.errors import DesignInfeasible, FeederInvalid, NotObservable

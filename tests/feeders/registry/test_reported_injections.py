@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import load, names, to_frame
-from feeders.registry.registry import design
+from feeders.registry import design
 from feeders.simulation.scenario import START
 from feeders.simulation.trial import AttackKind, AttackSpec, LoadError, Trial, TrialMeterErrors, frames
 from gridsec.attack import Bias

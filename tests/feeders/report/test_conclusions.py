@@ -10,8 +10,7 @@ import pytest
 from feeders.model.site import Site
 from feeders.report.conclusions import conclusion
 from feeders.report.html import StudyOutcome
-from feeders.report.legends import legend
-from feeders.report.text import Value, said
+from feeders.report.text import Value, legend, said
 from feeders.studies.comparison import HEADERS
 from feeders.studies.detectable import Detectable
 from feeders.studies.droop.limits import BandGuarantee

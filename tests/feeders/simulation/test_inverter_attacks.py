@@ -7,7 +7,7 @@ import json
 import numpy as np
 
 from feeders.model.site import load
-from feeders.simulation.meters import MeterErrors
+from feeders.simulation.plant import MeterErrors
 from feeders.simulation.powerflow import PowerFlow
 from feeders.simulation.recording import scenario_from_json, scenario_to_json
 from feeders.simulation.scenario import START, Scenario, SimulatedTick, simulate

@@ -15,7 +15,7 @@ from scipy.optimize import root
 from feeders.model.site import Site, from_tables
 from feeders.simulation.plant import TOLERANCE_PU, ClosedLoop, Loads, NoEquilibrium, Point
 from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged
-from gridsec.grid.droop import PRESETS, Droop, fleet, voltage_curve
+from gridsec.grid.devices import PRESETS, Droop, fleet, voltage_curve
 from tests.codes import refused
 from tests.feeders.villages import tables, village
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from feeders.model.site import Site, from_tables
-from feeders.simulation.meters import BUSBAR, Channel, MeterErrors, MeterOutage, SimulatedMeters
+from feeders.simulation.plant import BUSBAR, Channel, MeterErrors, MeterOutage, SimulatedMeters
 from gridsec.errors import InputInvalid
 from tests.codes import refused
 from tests.feeders.villages import tables, village

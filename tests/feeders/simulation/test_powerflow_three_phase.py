@@ -16,8 +16,13 @@ from feeders.convert.network import feeder_of
 from feeders.format.tables import LineRow
 from feeders.model.site import find, load
 from feeders.model.three_phase import spanned, three_phase, three_phase_names
-from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged
-from feeders.simulation.powerflow_three_phase import UnbalancedGrid, UnbalancedPowerFlow, sequence_ohm
+from feeders.simulation.powerflow import (
+    PowerFlow,
+    PowerFlowDiverged,
+    UnbalancedGrid,
+    UnbalancedPowerFlow,
+    sequence_ohm,
+)
 from gridsec.errors import InputInvalid
 from tests.codes import refused
 from tests.feeders import asymmetric

@@ -16,7 +16,7 @@ import pytest
 
 from feeders.simulation.attacks import RANDOM_KINDS, busbar_attack, random_attacks
 from feeders.simulation.demand import Variation
-from feeders.simulation.meters import BUSBAR, Channel, MeterErrors, MeterOutage
+from feeders.simulation.plant import BUSBAR, Channel, MeterErrors, MeterOutage
 from feeders.simulation.powerflow import PowerFlowDiverged
 from feeders.simulation.recording import (
     FORMAT,

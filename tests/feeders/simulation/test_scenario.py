@@ -10,8 +10,7 @@ import pytest
 
 from feeders.model.site import Site, load, names, to_frame
 from feeders.simulation.demand import Customers, Variation
-from feeders.simulation.meters import BUSBAR, Channel, MeterErrors, MeterOutage
-from feeders.simulation.plant import ClosedLoop, Loads, substeps
+from feeders.simulation.plant import BUSBAR, Channel, ClosedLoop, Loads, MeterErrors, MeterOutage, substeps
 from feeders.simulation.powerflow import PowerFlow
 from feeders.simulation.scenario import (
     START,
@@ -25,7 +24,7 @@ from feeders.simulation.scenario import (
 )
 from gridsec.attack import Bias, Replay, Stuck
 from gridsec.errors import InputInvalid
-from gridsec.grid.droop import voltage_curve
+from gridsec.grid.devices import voltage_curve
 from tests.codes import refused
 from tests.feeders.villages import village, village_without_inverters
 

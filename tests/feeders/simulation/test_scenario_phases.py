@@ -10,8 +10,8 @@ import pytest
 from feeders.model.site import Site, load, to_frame
 from feeders.simulation.attacks import fake_load
 from feeders.simulation.demand import Customers, Variation
-from feeders.simulation.meters import Channel, MeterErrors, MeterOutage, SimulatedMeters
-from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow
+from feeders.simulation.plant import Channel, MeterErrors, MeterOutage, SimulatedMeters
+from feeders.simulation.powerflow import UnbalancedPowerFlow
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.arrays import Floats
 

@@ -10,12 +10,11 @@ import numpy as np
 import pandapower as pp
 import pytest
 
-from feeders.model.load_uncertainty import load_doubt
-from feeders.model.site import Site, Snapshot, from_tables, load, to_frame
-from feeders.registry.registry import FAMILIES, DesignedEstimator, Estimator, choose, design
+from feeders.model.site import Site, Snapshot, from_tables, load, load_doubt, to_frame
+from feeders.registry import FAMILIES, DesignedEstimator, Estimator, choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec, NoSuchAttack, manipulations
 from feeders.simulation.demand import Customers
-from feeders.simulation.meters import Channel, MeterOutage
+from feeders.simulation.plant import Channel, MeterOutage
 from feeders.simulation.scenario import START, simulate
 from feeders.simulation.trial import FrameTruth, LoadError, Trial, TrialMeterErrors, frames, judge
 from gridsec.arrays import Floats
@@ -319,8 +318,8 @@ def test_a_silent_meter_tells_no_powers(ask: str) -> None:
     made = trial(site=from_tables(replace(tables, meta=meta)), duration_s=4.0, profile_s=0.0)
     mute = MeterOutage(small().meter_ids[5], START + 2.0, START + 3.0)
     scenario = replace(made.scenario, channel=Channel(silences=(mute,)))
-    nobody = np.full(13, np.nan)
-    lost = to_frame(made.stated, Snapshot(START + 2.0, nobody, nobody, nobody, np.nan))
+    none = np.full(13, np.nan)
+    lost = to_frame(made.stated, Snapshot(START + 2.0, none, none, none, np.nan))
     customer = small().meters[5]
     names = ("p", "p_error", "q", "q_error", *(("p_std", "q_std") if ask == "profiles" else ()))
     for tick, ((frame, _), (plain, _)) in enumerate(zip(frames(made, scenario), frames(made), strict=True)):

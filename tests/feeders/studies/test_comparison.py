@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import Site, from_tables, load
-from feeders.registry.registry import FAMILIES, choose, design
+from feeders.registry import FAMILIES, choose, design
 from feeders.simulation.attacks import AttackKind
 from feeders.simulation.trial import judge
 from feeders.studies.comparison import (

@@ -10,7 +10,7 @@ import pytest
 from feeders.model.site import load
 from feeders.studies.campaign.guarantees import Rehearsal, rehearse
 from feeders.studies.detectable import Detectable, detectable, workers
-from feeders.studies.workers import Here, Processes
+from feeders.studies.running import Here, Processes
 from gridsec.errors import InputInvalid
 from tests.codes import refused
 from tests.feeders.studies.rural import RURAL, rural_sizes

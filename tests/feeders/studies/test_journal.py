@@ -19,7 +19,7 @@ from feeders.model.site import load
 from feeders.studies.campaign.guarantees import rehearse
 from feeders.studies.comparison import ComparisonPlan, ComparisonRow, compare
 from feeders.studies.detectable import detectable
-from feeders.studies.journal import InUse, Journal, Keeper, OtherStudy, remove, versions, worked
+from feeders.studies.running import InUse, Journal, Keeper, OtherStudy, remove, versions, worked
 from tests.codes import refused
 from tests.journals import head_of, rows
 
@@ -102,7 +102,7 @@ def test_the_database_of_another_program_is_refused_and_not_changed(tmp_path: Pa
 WRITE = """
 import sys
 from pathlib import Path
-from feeders.studies.journal import Journal
+from feeders.studies.running import Journal
 journal = Journal(Path(sys.argv[1]), {"study": "any", "number": 3})
 while True:
     journal.put(str(journal.done), [journal.done] * 1000)
@@ -130,7 +130,7 @@ def test_a_process_that_is_killed_while_it_writes_loses_one_piece_at_most(
 HOLD = """
 import sys
 from pathlib import Path
-from feeders.studies.journal import Journal
+from feeders.studies.running import Journal
 journal = Journal(Path(sys.argv[1]), {"study": "any", "number": 3})
 journal.put("theirs", 1)
 print("ready", flush=True)

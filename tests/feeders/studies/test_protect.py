@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from feeders.model.load_uncertainty import unread
-from feeders.model.site import from_tables, load
+from feeders.model.site import from_tables, load, unread
 from feeders.simulation.powerflow import PowerFlow
 from feeders.studies.operating import box, false_powers, squared, volts_of_lie
 from feeders.studies.protect import Goal, protect

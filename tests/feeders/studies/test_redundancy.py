@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 from feeders.model.site import load
-from feeders.studies.journal import Journal, OtherStudy
 from feeders.studies.redundancy import ALL, SILENT, redundancy
+from feeders.studies.running import Journal, OtherStudy
 from feeders.studies.unobservable import Attack, CurvePositions
 from gridsec.errors import InputInvalid
 from tests.codes import refused

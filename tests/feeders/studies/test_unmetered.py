@@ -10,10 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from feeders.model.load_uncertainty import unread
-from feeders.model.site import Site, load
+from feeders.model.site import Site, load, unread
 from feeders.profiles import Season
-from feeders.registry.registry import DesignedEstimator, design
+from feeders.registry import DesignedEstimator, design
 from feeders.simulation.scenario import START
 from feeders.simulation.trial import AttackKind, Trial, TrialMeterErrors, frames
 from feeders.studies.campaign.guarantees import Rehearsal, rehearse

@@ -22,8 +22,7 @@ from gridsec.estimators.data_errors import (
     follow,
 )
 from gridsec.estimators.plant import Plant
-from gridsec.grid.droop import fleet
-from gridsec.grid.meter import MeterAccuracy
+from gridsec.grid.devices import MeterAccuracy, fleet
 from gridsec.grid.network import Network
 from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.radial import Feeder

@@ -12,14 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from feeders.model.site import load, plant, to_frame
-from feeders.registry.registry import FAMILIES, choose, design
+from feeders.registry import FAMILIES, choose, design
 from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
 from gridsec.arrays import Ints
 from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
-from gridsec.estimators import partial, thresholds
+from gridsec.estimators import detection, partial
 from gridsec.estimators import partial as partial_observers
-from gridsec.estimators.inputs import PreviousStep, clean
 from gridsec.estimators.partial import PartialDesign, PartialState
+from gridsec.estimators.plant import PreviousStep, clean
 from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
 from gridsec.observers import circle
 from tests.codes import refused
@@ -447,7 +447,7 @@ def test_bounds_shrink_as_observers_settle() -> None:
         assert (np.abs(street.x - parts.x) <= parts.bound.free).all()
         assert (np.abs(street.x - parts.driven) <= parts.bound.driven).all()
         sums.append(float(parts.bound.free.sum()))
-    widest = thresholds.widest(made.setting.errors).free
+    widest = detection.widest(made.setting.errors).free
     assert sums[0] <= widest.sum()
     assert all(late <= early * 1.05 for early, late in pairwise(sums))
     assert sums[-1] < 0.5 * sums[0]

@@ -13,7 +13,7 @@ from gridsec.errors import InputInvalid
 from gridsec.estimators import exact_bank, partial, sequential, set_search, unknown_input
 from gridsec.estimators.plant import Options, Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialOptions
-from gridsec.grid.meter import steady_rounding
+from gridsec.grid.devices import steady_rounding
 from tests.codes import refused
 from tests.gridsec.street import accuracy, make_plant
 

@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from feeders.model.site import load, to_frame
-from feeders.registry.registry import choose, design
+from feeders.registry import choose, design
 from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
 from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
 from gridsec.estimators import set_search
-from gridsec.estimators.inputs import PreviousStep, clean
+from gridsec.estimators.plant import PreviousStep, clean
 from gridsec.estimators.set_search import advance
 from gridsec.interface import Cause, Decision
 from tests.codes import refused

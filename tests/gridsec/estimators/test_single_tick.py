@@ -22,8 +22,7 @@ from gridsec.errors import DesignInfeasible, NotObservable
 from gridsec.estimators import sequential, single_tick
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialState
-from gridsec.estimators.sequential.load_uncertainty import prior
-from gridsec.estimators.sequential.posterior import condition, leave_one_out
+from gridsec.estimators.sequential.posterior import condition, leave_one_out, voltage_prior
 from gridsec.estimators.sequential.search import Decoder, DecoderInput, Limits
 from gridsec.estimators.single_tick import fewest, least_squares, match, pursue
 from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
@@ -67,7 +66,7 @@ def bench(rng: np.random.Generator, p: int = 8, sigmas: float = 3.5, most: int =
     R, X = model.R_bus[1:], model.X_bus[1:]
     A = np.hstack([2.0 * R * P_STD, 2.0 * X * Q_STD, np.full((p, 1), BUSBAR)])
     doubt = LoadDoubt(np.full(p, P_STD), np.full(p, Q_STD), 600.0)
-    before = prior(tree, np.arange(1, p + 1), doubt, busbar=BUSBAR)
+    before = voltage_prior(tree, np.arange(1, p + 1), doubt, busbar=BUSBAR)
     none, zeros = np.zeros(p, dtype=bool), np.zeros(p)
 
     def evidence(m: Floats, live: Bools | None = None) -> DecoderInput:
@@ -255,8 +254,8 @@ def test_a_meter_without_a_reading_has_no_influence_and_is_not_accused(decoder: 
     ):
         np.testing.assert_array_equal(first.meters, second.meters)
         assert not first.meters[[1, 6]].any()
-    nobody = decoder(made.evidence(np.where(live, 0.0, m), np.zeros(8, dtype=bool)))
-    assert not nobody[0].meters.any()
+    empty = decoder(made.evidence(np.where(live, 0.0, m), np.zeros(8, dtype=bool)))
+    assert not empty[0].meters.any()
 
 
 def prepare(plant: Plant, decoder: Decoder, *, step_s: float = 1.0, most: int = 2) -> SequentialDesign:

@@ -18,9 +18,9 @@ from numpy.random import Generator, default_rng
 from scipy.optimize import linprog
 
 from feeders.model.site import Site, from_tables, load, plant, to_frame
-from feeders.registry.registry import choose
-from feeders.registry.registry import design as watcher
-from feeders.simulation.meters import Channel, MeterErrors, MeterOutage
+from feeders.registry import choose
+from feeders.registry import design as watcher
+from feeders.simulation.plant import Channel, MeterErrors, MeterOutage
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.attack import Bias, InverterAttack
 from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from feeders.model.site import load, to_frame
-from feeders.registry.registry import choose, design
+from feeders.registry import choose, design
 from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
 from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
 from gridsec.estimators import windowed

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import assume, given
 
 from gridsec.errors import FeederInvalid
-from gridsec.estimators.thresholds import curve_mismatch
-from gridsec.grid.droop import PRESETS, Droop, capped, fleet, preset, voltage_curve
+from gridsec.estimators.detection import curve_mismatch
+from gridsec.grid.devices import PRESETS, Droop, capped, fleet, preset, voltage_curve
 from gridsec.planning.droop.stability import enlarged, steepened
 from tests.codes import refused
 

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from gridsec.arrays import Floats
 from gridsec.grid.intervals import Sweeps, bounds
 from gridsec.grid.meshed import MeshedFeeder
-from gridsec.grid.network import InPhases
-from gridsec.grid.phased import PhasedFeeder
+from gridsec.grid.phased import InPhases, PhasedFeeder
 from tests.gridsec.meshes import ac, random_mesh
 from tests.gridsec.unbalanced import ac_places, random_phased_mesh, random_three_phase
 

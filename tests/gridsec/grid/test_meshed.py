@@ -11,7 +11,7 @@ from hypothesis import given, settings
 
 from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid
-from gridsec.grid.droop import fleet
+from gridsec.grid.devices import fleet
 from gridsec.grid.meshed import MeshedFeeder, admittance, impedances
 from gridsec.observers.certificates import certify, verify
 from gridsec.observers.lure import close_loop

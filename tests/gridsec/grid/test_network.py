@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid
 from gridsec.grid.meshed import MeshedFeeder, impedances
-from gridsec.grid.network import InPhases, Network, Power
-from gridsec.grid.phased import PhasedFeeder
+from gridsec.grid.network import Network, Power
+from gridsec.grid.phased import InPhases, PhasedFeeder
 from gridsec.grid.radial import Feeder
 from gridsec.grid.three_phase import PHASES
 from tests.codes import refused

@@ -248,17 +248,17 @@ def test_feeders_without_branches_or_without_customers() -> None:
     )
     np.testing.assert_array_equal(lindist3flow(bare).R, np.zeros((3, 3)))
     np.testing.assert_allclose(bus_voltages(bare, -np.ones(3), np.zeros(3), np.ones(3)), np.ones((3, 1)))
-    nobody = replace(
+    empty = replace(
         random_three_phase(5),
         bus=np.zeros(0, dtype=np.intp),
         connected=np.zeros((0, 3), dtype=bool),
         customers=(),
     )
-    model = lindist3flow(nobody)
-    assert per_customer(nobody, model).R.shape == model.R.shape == (0, 0)
-    assert sensitivities(nobody, np.zeros(0), np.zeros(0), np.ones(3)).X.shape == (0, 0)
-    idle = bus_voltages(nobody, np.zeros(0), np.zeros(0), np.full(3, 1.1))
-    np.testing.assert_allclose(idle, np.full((3, len(nobody.buses)), 1.1))
+    model = lindist3flow(empty)
+    assert per_customer(empty, model).R.shape == model.R.shape == (0, 0)
+    assert sensitivities(empty, np.zeros(0), np.zeros(0), np.ones(3)).X.shape == (0, 0)
+    idle = bus_voltages(empty, np.zeros(0), np.zeros(0), np.full(3, 1.1))
+    np.testing.assert_allclose(idle, np.full((3, len(empty.buses)), 1.1))
 
 
 def test_a_single_phase_lateral_in_closed_form() -> None:

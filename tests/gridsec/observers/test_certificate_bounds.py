@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from scipy.integrate import solve_ivp
 
-from gridsec.grid.droop import Droop
+from gridsec.grid.devices import Droop
 from gridsec.observers.certificates import certify, error_bound, reactance, small_gain
 from gridsec.observers.lure import Lure, settle
 from tests.gridsec.certified import norm, seeds

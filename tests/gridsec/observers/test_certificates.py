@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 from gridsec.arrays import spectral_radius
 from gridsec.errors import DesignInfeasible
-from gridsec.grid.droop import Droop, fleet
+from gridsec.grid.devices import Droop, fleet
 from gridsec.grid.radial import Feeder
 from gridsec.observers.certificates import (
     Certificate,

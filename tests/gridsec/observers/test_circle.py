@@ -178,8 +178,8 @@ def test_a_silent_or_untrusted_meter_has_exactly_no_influence(kind: str) -> None
 def test_without_any_reading_the_observer_is_the_model() -> None:
     of = tree()
     design = by_lmi(of, 0, 1, 3)
-    x, u, nobody = np.full(5, 0.02), np.full(6, 0.08), np.zeros(5, dtype=bool)
-    after = circle.step(design, circle.init(design, 0.0, x), np.full(5, np.nan), u, nobody, 2.0)
+    x, u, none = np.full(5, 0.02), np.full(6, 0.08), np.zeros(5, dtype=bool)
+    after = circle.step(design, circle.init(design, 0.0, x), np.full(5, np.nan), u, none, 2.0)
     np.testing.assert_allclose(after.x, advance(of.lure, x, u, 2.0), rtol=1e-12)
 
 

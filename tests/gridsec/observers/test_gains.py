@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from gridsec.errors import DesignInfeasible, InputInvalid
-from gridsec.grid.droop import PRESETS, fleet
+from gridsec.grid.devices import PRESETS, fleet
 from gridsec.observers.gains import (
     CircleGains,
     circle_matrix,

@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from gridsec.arrays import spectral_radius
 from gridsec.errors import DesignInfeasible, FeederInvalid, InputInvalid
-from gridsec.grid.droop import PRESETS, Droop, fleet
+from gridsec.grid.devices import PRESETS, Droop, fleet
 from gridsec.observers.lure import (
     POLICY,
     Lure,
@@ -214,8 +214,8 @@ def test_the_base_power_is_anybodys_choice(base_kva: float) -> None:
 @pytest.mark.parametrize("lead", [(), (3,), (2, 3)])
 def test_no_inverters_in_batches(lead: tuple[int, ...]) -> None:
     feeder = random_feeder(4)
-    nobody = fleet(np.array([], dtype=np.intp), [], np.array([]), 100.0)
-    lure = close_loop(feeder, nobody, np.array([0]))
+    no_meters = fleet(np.array([], dtype=np.intp), [], np.array([]), 100.0)
+    lure = close_loop(feeder, no_meters, np.array([0]))
     u = np.zeros((*lead, len(feeder.customers)))
     assert equilibrium(lure, u, tol=1e-10, max_iter=5).shape == (*lead, 0)
     empty = np.zeros((*lead, 0))

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 
 from feeders.model.three_phase import load_three_phase
-from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow
+from feeders.simulation.powerflow import UnbalancedPowerFlow
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible
-from gridsec.grid.droop import Droop, fleet
+from gridsec.grid.devices import Droop, fleet
 from gridsec.grid.three_phase import ThreePhaseFeeder, bus_voltages, lindist3flow, per_customer
 from gridsec.observers.certificates import Certificate, reactance, small_gain, verify
 from gridsec.observers.lure import Lure, close_loop, equilibrium, known_input

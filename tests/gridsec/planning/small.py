@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 
 from gridsec.arrays import Floats, Ints
-from gridsec.grid.droop import fleet
+from gridsec.grid.devices import fleet
 from gridsec.grid.meshed import MeshedFeeder
 from gridsec.grid.network import Network
 from gridsec.grid.phased import PhasedFeeder

@@ -113,8 +113,8 @@ def test_a_search_that_is_cut_short_says_what_is_left_open() -> None:
 
 
 def test_nobody_lies_where_nobody_can() -> None:
-    nobody = Corridor(np.zeros((0, 3)), np.zeros(3), 1)
+    empty = Corridor(np.zeros((0, 3)), np.zeros(3), 1)
     for must in (None, 1):
-        found = furthest(nobody, np.ones(3), must=must)
+        found = furthest(empty, np.ones(3), must=must)
         assert found.size == found.bound == 0.0
         assert not found.lies.any()

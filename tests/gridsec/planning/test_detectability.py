@@ -13,8 +13,7 @@ from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, design
 from gridsec.estimators.sequential.posterior import chi_square
 from gridsec.estimators.sequential.search import set_cost
-from gridsec.grid.droop import fleet
-from gridsec.grid.meter import MeterAccuracy
+from gridsec.grid.devices import MeterAccuracy, fleet
 from gridsec.planning.detectability import Rule, largest_shift, named_size, rule
 from tests.gridsec.planning.small import tree
 

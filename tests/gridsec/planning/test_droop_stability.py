@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, InputInvalid
-from gridsec.grid.droop import Droop, voltage_curve
+from gridsec.grid.devices import Droop, voltage_curve
 from gridsec.grid.radial import Feeder
 from gridsec.planning.droop.ac_sensitivity import InjectionBox, currents, network, region, sensitivity, solve
 from gridsec.planning.droop.equilibrium import always, at_rest, injected, rest, shares, shares_of_gain

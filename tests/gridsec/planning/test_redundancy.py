@@ -7,7 +7,7 @@ import pytest
 
 from gridsec.arrays import Floats
 from gridsec.errors import InputInvalid
-from gridsec.grid.droop import fleet
+from gridsec.grid.devices import fleet
 from gridsec.grid.meshed import MeshedFeeder
 from gridsec.grid.network import Network
 from gridsec.grid.radial import Feeder
@@ -47,17 +47,17 @@ def test_indices_of_all_and_of_each_meter_equal_brute_force(
 ) -> None:
     A, C = system(seed, busbar=seed % 3 == 0, phased=phased)
     found = given(A, C, persistent=persistent)
-    everybody = list(range(len(C)))
-    nobody = np.zeros(len(C), dtype=np.bool_)
-    assert fewest_meters(found).count == brute(A, C, everybody, everybody, persistent=persistent)
-    for j in everybody:
-        meter = meter_redundancy(found, j, nobody)
-        assert meter.own.count == brute(A, C, everybody, everybody, persistent=persistent, must=j)
+    every = list(range(len(C)))
+    empty = np.zeros(len(C), dtype=np.bool_)
+    assert fewest_meters(found).count == brute(A, C, every, every, persistent=persistent)
+    for j in every:
+        meter = meter_redundancy(found, j, empty)
+        assert meter.own.count == brute(A, C, every, every, persistent=persistent, must=j)
         assert meter.critical == (meter.own.count == 1)
         if np.isfinite(meter.own.count):
             assert j in meter.own.sensors
             assert meter.own.sensors.size == meter.own.count
-        rest = [k for k in everybody if k != j]
+        rest = [k for k in every if k != j]
         assert meter.without.count == brute(A, C, rest, rest, persistent=persistent)
 
 
@@ -93,9 +93,9 @@ def test_parts_of_a_mesh_are_fed_through_one_bus_and_equal_brute_force(seed: int
     mesh, _, meters, _ = tree(seed, ties=1 + seed % 2)
     assert isinstance(mesh, MeshedFeeder)
     A, C = system(seed, ties=1 + seed % 2)
-    found, everybody = given(A, C, persistent=persistent), list(range(len(C)))
+    found, every = given(A, C, persistent=persistent), list(range(len(C)))
     at = mesh.bus[meters].tolist()
-    inside = [[j for j in everybody if at[j] in cut_off(mesh, bus)] for bus in range(1, len(mesh.buses))]
+    inside = [[j for j in every if at[j] in cut_off(mesh, bus)] for bus in range(1, len(mesh.buses))]
     pieces = parts(mesh.tree, mesh.bus[meters], mesh.ends)
     assert sorted(part.meters.tolist() for part in pieces) == sorted(
         map(list, {tuple(k) for k in inside if k})
@@ -105,7 +105,7 @@ def test_parts_of_a_mesh_are_fed_through_one_bus_and_equal_brute_force(seed: int
         one = {0, part.bus}
         assert part.branch == any({a, b} == one for a, b in [*enumerate(mesh.tree.parent, 1), *mesh.ends])
         counted = part_redundancy(found, part, np.zeros(len(C), dtype=np.bool_)).count
-        assert counted == brute(A, C, part.meters.tolist(), everybody, persistent=persistent)
+        assert counted == brute(A, C, part.meters.tolist(), every, persistent=persistent)
 
 
 @FEEDERS
@@ -189,12 +189,12 @@ def test_a_meter_that_no_unknown_load_moves_has_no_index(seed: int, form: str) -
     W = unknown_voltages(feeder, np.array([5]), busbar=False, tol=TOL)
     np.testing.assert_allclose(W.T @ W, np.eye(2), atol=1e-12)
     A, C = unknown_pair(lure, lure.slope, W)
-    found, nobody = given(A, C, persistent=True), np.zeros(7, dtype=np.bool_)
-    counts = [meter_redundancy(found, j, nobody).own.count for j in range(7)]
+    found, empty = given(A, C, persistent=True), np.zeros(7, dtype=np.bool_)
+    counts = [meter_redundancy(found, j, empty).own.count for j in range(7)]
     assert counts[:3] == [np.inf] * 3
-    everybody = list(range(7))
+    every = list(range(7))
     # Oracle: ranks of what stays, without the meters that hear nothing.
-    assert min(counts[3:]) == brute(A, C[3:], everybody[:4], everybody[:4], persistent=True)
+    assert min(counts[3:]) == brute(A, C[3:], every[:4], every[:4], persistent=True)
     # Nobody with a meter feels it: there is nothing to imitate, however it is rounded.
     lure = close_loop(feeder, droop, np.arange(3))
     A, C = unknown_pair(lure, lure.slope, W)

@@ -76,8 +76,8 @@ def test_the_largest_lie_does_fit_to_an_honest_feeder(seed: int) -> None:
 
 def test_protection_and_collusion_are_monotone() -> None:
     box = street(4)
-    nobody = np.zeros(box.meters.size, dtype=np.bool_)
-    one = nobody.copy()
+    none = np.zeros(box.meters.size, dtype=np.bool_)
+    one = none.copy()
     one[1] = True
     for j in range(box.meters.size):
         sizes = [largest_lie(box, j, liars).size for liars in (1, 2, 3, 4)]

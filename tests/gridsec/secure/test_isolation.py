@@ -17,8 +17,8 @@ from feeders.model.site import load
 from feeders.simulation.powerflow import PowerFlow
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
-from gridsec.estimators.thresholds import curve_mismatch
-from gridsec.grid.droop import Droop, voltage_curve
+from gridsec.estimators.detection import curve_mismatch
+from gridsec.grid.devices import Droop, voltage_curve
 from gridsec.interface import Cause, Decision
 from gridsec.observers.lmi.sampled import DiscreteLure, advance
 from gridsec.observers.lure import close_loop, known_input

@@ -14,7 +14,7 @@ import pytest
 
 from feeders.model.site import load
 from feeders.simulation.attacks import random_attacks
-from feeders.simulation.meters import Channel
+from feeders.simulation.plant import Channel
 from feeders.simulation.recording import record
 from feeders.simulation.scenario import Scenario
 from tests.service.commands import command, plain

@@ -15,7 +15,7 @@ from typing import NoReturn
 
 import pytest
 
-from feeders.studies.journal import worked
+from feeders.studies.running import worked
 from gridsec.errors import GridsecError
 from service.cli.session import keeping
 from tests.journals import rows
@@ -232,7 +232,7 @@ def test_work_that_was_done_before_an_error_is_kept(cache: Path) -> None:
 DEAF = """
 import ctypes, sys
 from pathlib import Path
-from feeders.studies.journal import worked
+from feeders.studies.running import worked
 from service.cli.session import keeping
 
 def solver():

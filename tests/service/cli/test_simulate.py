@@ -11,7 +11,7 @@ from typing import Any, cast
 import pytest
 
 from feeders.model.site import from_tables, load
-from feeders.simulation.meters import Channel
+from feeders.simulation.plant import Channel
 from feeders.simulation.scenario import Scenario
 from service.cli.simulate import OutOfStep, Pace, play
 from service.ingest.align import Aligner, Clock, rules

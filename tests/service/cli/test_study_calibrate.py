@@ -11,7 +11,7 @@ import pytest
 from feeders.format.tables import read, write
 from feeders.model.site import load
 from feeders.simulation.demand import Variation
-from feeders.simulation.meters import MeterErrors
+from feeders.simulation.plant import MeterErrors
 from feeders.simulation.recording import record
 from feeders.simulation.scenario import Scenario
 from tests.service.commands import command

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from feeders.registry.registry import FAMILIES
+from feeders.registry import FAMILIES
 from feeders.studies.comparison import BEGIN, END, ComparisonRow
 from service.cli import study_compare
 from tests.service.commands import command

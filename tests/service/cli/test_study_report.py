@@ -13,7 +13,7 @@ import pytest
 from playwright.sync_api import Browser
 
 from feeders.model.site import load
-from feeders.simulation.meters import MeterErrors
+from feeders.simulation.plant import MeterErrors
 from feeders.simulation.recording import record
 from feeders.simulation.scenario import Scenario
 from service.cli.study_report import STUDIES, Asked, _command, misplaced

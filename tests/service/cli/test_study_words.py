@@ -15,9 +15,8 @@ import pytest
 from feeders.format.tables import write
 from feeders.model.site import load
 from feeders.report import conclusions
-from feeders.report.legends import legend
-from feeders.report.text import said
-from feeders.simulation.meters import MeterErrors
+from feeders.report.text import legend, said
+from feeders.simulation.plant import MeterErrors
 from feeders.simulation.recording import record
 from feeders.simulation.scenario import Scenario
 from gridsec.papers import draw

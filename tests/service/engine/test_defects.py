@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from feeders.model.site import Site, load
-from feeders.registry.registry import DesignedEstimator
+from feeders.registry import DesignedEstimator
 from gridsec.interface import Cause, Frame
 from service.alarms.state_machine import AlarmKind, Condition, conditions
 from service.engine.engine import BAD_PER_ROUND, BAD_PER_SOURCE, Engine, RuntimeConfig

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from feeders.model.site import Site
-from feeders.registry.registry import DesignedEstimator
+from feeders.registry import DesignedEstimator
 from gridsec.interface import Frame
 from service.alarms.state_machine import (
     AlarmState,

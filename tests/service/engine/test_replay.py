@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from feeders.model.site import Site, from_tables, load
-from feeders.registry.registry import DesignedEstimator
-from feeders.simulation.meters import Channel
+from feeders.registry import DesignedEstimator
+from feeders.simulation.plant import Channel
 from feeders.simulation.recording import read_recording, record
 from feeders.simulation.scenario import Scenario, SimulatedReading, by_arrival, random_attacks, simulate
 from gridsec.interface import Frame

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from feeders.model.site import Site, load
-from feeders.simulation.meters import BUSBAR
+from feeders.simulation.plant import BUSBAR
 from gridsec.interface import Cause
 from service.alarms.state_machine import AlarmKind
 from service.cli.simulate import key_of

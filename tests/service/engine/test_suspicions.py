@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import Site, from_tables, load
-from feeders.simulation.meters import MeterErrors
+from feeders.simulation.plant import MeterErrors
 from feeders.simulation.scenario import Scenario, SimulatedReading, by_arrival, simulate
 from gridsec.attack import Scaling
 from gridsec.estimators.sequential import Commission, to_arrays

@@ -9,9 +9,9 @@ import pytest
 from pydantic import TypeAdapter
 
 from benchmarks.calibrate_exchanges import truth_of
+from feeders import registry
 from feeders.format.tables import FeederTables, write
 from feeders.model.site import Site, from_tables, load, to_frame
-from feeders.registry import registry
 from feeders.simulation.recording import read_recording, record
 from feeders.simulation.scenario import Scenario, simulate, snapshots
 from gridsec.estimators import data_errors

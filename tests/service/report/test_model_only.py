@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from feeders.model.site import Site, from_tables, load, to_frame
-from feeders.registry.registry import choose
-from feeders.simulation.meters import BUSBAR as BUSBAR_SOURCE
+from feeders.registry import choose
+from feeders.simulation.plant import BUSBAR as BUSBAR_SOURCE
 from gridsec.interface import Cause
 from service.alarms.conditions import AlarmKind, conditions
 from service.api.models import HistoryPoint
@@ -37,7 +37,7 @@ def site() -> Site:
     return load(FEEDER)
 
 
-def everybody(_second: int, _meter: str) -> tuple[float, float]:
+def every(_second: int, _meter: str) -> tuple[float, float]:
     return 0.0, QUIET_VOLT
 
 
@@ -94,14 +94,14 @@ def test_without_any_reading_each_value_is_model_only(
 
         street.go_on(3, silence)
         assert now() == ({True}, None, False)
-        street.go_on(20, everybody)
+        street.go_on(20, every)
         assert now() == ({False}, START + 22, judges)
         # The busbar's voltage is the level of all values; no meter judges it here.
         street.go_on(4, busbar_alone)
         assert now() == ({False}, START + 26, False)
         street.go_on(4, one_meter)
         assert (now()[0], now()[2]) == ({not uses_one}, False)
-        street.go_on(4, everybody)
+        street.go_on(4, every)
         street.go_on(SILENT_S, silence)
         # A reading serves for two and a half ticks.
         assert now() == ({True}, START + 36, False)
@@ -112,7 +112,7 @@ def test_history_marks_what_is_model_only_and_leaves_it_out_of_the_extremes(
 ) -> None:
     with Store(f"sqlite:///{tmp_path}/gridsec.db") as store:
         street = Street(site, store)
-        street.go_on(30, everybody)
+        street.go_on(30, every)
         street.go_on(30, silence)
         rows = [HistoryPoint.model_validate(row) for row in store.history(FEEDER, meter="m05", limit=500)]
         kept = {row.t - START: row for row in rows}
@@ -131,7 +131,7 @@ def test_a_voltage_alarm_is_neither_raised_nor_cleared_by_the_model_alone(site: 
         street = Street(tight(site, 0.93), store)
         street.go_on(20, silence)
         assert AlarmKind.VOLTAGE_LIMIT not in {kind for kind, _ in street.standing()}
-        street.go_on(20, everybody)
+        street.go_on(20, every)
         raised = {alarm for alarm in street.standing() if alarm[0] is AlarmKind.VOLTAGE_LIMIT}
         assert len(raised) == len(site.meter_ids)
         street.go_on(20, silence)

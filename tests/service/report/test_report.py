@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from feeders.model.site import Site, load, to_frame
-from feeders.registry.registry import choose
-from feeders.simulation.meters import MeterErrors
+from feeders.registry import choose
+from feeders.simulation.plant import MeterErrors
 from feeders.simulation.scenario import Scenario, random_attacks, simulate
 from gridsec.attack import InverterAttack
 from gridsec.interface import Cause, Decision, Estimate, Explanation, ManipulationKind, Verdict
@@ -243,17 +243,17 @@ def test_kinds_inverters_and_a_standard_deviation_of_its_own(site: Site) -> None
 def test_ambiguity_is_one_sentence_and_a_list(site: Site) -> None:
     estimate, verdict = judged(site, 6.0, 3)
     p, m = len(site.meter_ids), site.droop.tau.size
-    nobody, none = np.zeros(p, dtype=bool), np.zeros(m, dtype=bool)
+    empty, none = np.zeros(p, dtype=bool), np.zeros(m, dtype=bool)
     customers = np.arange(len(site.feeder.customers))
     verdict = replace(
         verdict,
         decision=Decision.UNDECIDED,
         cause=Cause.AMBIGUOUS,
-        suspects=nobody,
+        suspects=empty,
         explanations=(
             Explanation(np.arange(p) == 1, none, 0.7, customers == 2),
-            Explanation(nobody, np.arange(m) == 1, 0.2),
-            Explanation(nobody, none, 0.1, customers < 2),
+            Explanation(empty, np.arange(m) == 1, 0.2),
+            Explanation(empty, none, 0.1, customers < 2),
         ),
     )
     report = build(site, tick(site), 2, estimate, verdict)

@@ -16,7 +16,7 @@ import sqlalchemy as sa
 
 from feeders.format.tables import to_json
 from feeders.model.site import Site, load
-from feeders.simulation.meters import BUSBAR
+from feeders.simulation.plant import BUSBAR
 from service.alarms.state_machine import AlarmState, acknowledged
 from service.cli.simulate import key_of
 from service.engine.engine import Engine

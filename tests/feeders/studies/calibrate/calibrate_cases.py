@@ -12,8 +12,8 @@ from feeders.format.tables import FeederTables
 from feeders.model.site import Site, from_tables, load
 from feeders.model.three_phase import ThreePhaseSite
 from feeders.simulation.demand import Customers, Variation
-from feeders.simulation.meters import Channel, MeterErrors, SimulatedMeters
-from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow
+from feeders.simulation.plant import Channel, MeterErrors, SimulatedMeters
+from feeders.simulation.powerflow import UnbalancedPowerFlow
 from feeders.simulation.recording import Recording, record
 from feeders.simulation.scenario import START, Scenario
 from feeders.studies.calibrate.search import longer

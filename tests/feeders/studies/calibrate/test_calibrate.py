@@ -18,7 +18,7 @@ from feeders.simulation.scenario import START
 from feeders.studies.calibrate.readings import frames
 from feeders.studies.calibrate.search import FileErrorKind
 from feeders.studies.calibrate.study import OtherFeeder, calibrate
-from feeders.studies.journal import OtherStudy
+from feeders.studies.running import OtherStudy
 from gridsec.attack import Attack, Bias, Drift, Replay, Stuck
 from gridsec.errors import InputInvalid
 from tests.codes import refused

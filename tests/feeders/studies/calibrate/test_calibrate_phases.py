@@ -14,8 +14,8 @@ import pytest
 from feeders.format.tables import CustomerRow, FeederMeta, FeederTables, LineRow, validate
 from feeders.model.site import from_tables
 from feeders.model.three_phase import series_of, three_phase
-from feeders.simulation.meters import MeterErrors
-from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow
+from feeders.simulation.plant import MeterErrors
+from feeders.simulation.powerflow import UnbalancedPowerFlow
 from feeders.simulation.recording import RecordingInvalid, record
 from feeders.simulation.scenario import Scenario
 from feeders.studies.calibrate.feeder import network, powers, series

@@ -21,15 +21,32 @@ from scipy.stats import beta
 
 from feeders.model.site import Site, from_tables, load
 from feeders.profiles import Season
-from feeders.registry.registry import design
+from feeders.registry import design
 from feeders.simulation.attacks import AttackKind
 from feeders.simulation.demand import Variation
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, frames, judge
 from feeders.studies.campaign.plan import CLEAN, AttackClass, CampaignCase, CampaignPlan, Design, Place
-from feeders.studies.campaign.scene import attacks, liars, risings
-from feeders.studies.campaign.study import Campaign, NothingPlayed, campaign, false_names, grouped, scenarios
-from feeders.studies.journal import OtherStudy, versions
-from feeders.studies.workers import ClusterUnusable, Dask, Here, Processes, WorkerLost, agree
+from feeders.studies.campaign.study import (
+    Campaign,
+    NothingPlayed,
+    attacks,
+    campaign,
+    false_names,
+    grouped,
+    liars,
+    risings,
+    scenarios,
+)
+from feeders.studies.running import (
+    ClusterUnusable,
+    Dask,
+    Here,
+    OtherStudy,
+    Processes,
+    WorkerLost,
+    agree,
+    versions,
+)
 from gridsec.attack import Coordinated, Random
 from gridsec.errors import InputInvalid
 from tests.codes import refused
@@ -436,7 +453,7 @@ def test_a_worker_that_computes_otherwise_is_refused(theirs: object) -> None:
 
 KILLED = """
 import multiprocessing, time
-from feeders.studies.workers import Processes
+from feeders.studies.running import Processes
 if __name__ == "__main__":
     made = Processes(2).run(time.sleep, [0, 1000, 1000])
     next(made)

@@ -11,14 +11,13 @@ import pytest
 from scipy.stats import beta
 
 from feeders.model.site import Site
-from feeders.registry.registry import DesignedEstimator, design
+from feeders.registry import DesignedEstimator, design
 from feeders.simulation.attacks import AttackKind
 from feeders.simulation.scenario import Scenario
 from feeders.simulation.trial import Trial, frames
 from feeders.studies.campaign.guarantees import promised
 from feeders.studies.campaign.plan import AttackClass, Place, Promise
-from feeders.studies.campaign.scene import attacks
-from feeders.studies.campaign.study import campaign
+from feeders.studies.campaign.study import attacks, campaign
 from feeders.studies.detectable import detectable
 from gridsec.interface import Estimate, Frame, Verdict
 from tests.feeders.studies.campaign.campaigns import PLAN, SITE
@@ -87,7 +86,7 @@ def test_broken_promises_are_counted_against_the_same_scene_without_the_lie(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Promises of which nothing is true, and an estimator that cries wolf; the oracle plays all in full."""
-    monkeypatch.setattr("feeders.studies.campaign.scene.design", crying_wolf)
+    monkeypatch.setattr("feeders.studies.campaign.study.design", crying_wolf)
     kinds = (
         AttackClass("loud", AttackKind.BIAS, (1.0, 3.0), promise=Promise.HIDDEN),
         AttackClass("small", AttackKind.BIAS, (0.2, 3.0), promise=Promise.NAMED),

@@ -13,9 +13,8 @@ import pytest
 from feeders.format.tables import CustomerRow, FeederMeta, FeederTables, LineRow
 from feeders.model.site import Site, from_tables
 from feeders.simulation.plant import ClosedLoop, Loads
-from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged
-from feeders.simulation.powerflow_three_phase import power_flow
-from feeders.studies.droop.fleets import Who, box, equip, point
+from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged, power_flow
+from feeders.studies.droop.fleets import Equipped, box, equip, point
 from feeders.studies.droop.limits import (
     BandGuarantee,
     Conditions,
@@ -40,11 +39,11 @@ from feeders.studies.droop.verdict import (
     steps,
     trajectories,
 )
-from feeders.studies.journal import OtherStudy
+from feeders.studies.running import OtherStudy
 from gridsec.arrays import Floats
 from gridsec.errors import FeederInvalid, InputInvalid
-from gridsec.grid.droop import Droop
-from gridsec.grid.droop import fleet as fleet_of
+from gridsec.grid.devices import Droop
+from gridsec.grid.devices import fleet as fleet_of
 from gridsec.planning.droop.ac_sensitivity import InjectionBox, sensitivity, solve
 from gridsec.planning.droop.equilibrium import rest
 from gridsec.planning.droop.stability import Update, enlarged, growth, slopes
@@ -188,7 +187,7 @@ def test_the_verdict_is_that_of_the_simulation_in_200_fleets_around_the_edge(
 def unsettled(interval: float = 60.0) -> tuple[Site, Droop, Update]:
     """The village with inverters so large that they over-correct when they jump to their set-points."""
     site = village()
-    return site, enlarged(equip(site, "ieee1547-b", Who.ALL), 12.0), Update(interval)
+    return site, enlarged(equip(site, "ieee1547-b", Equipped.ALL), 12.0), Update(interval)
 
 
 def test_an_unstable_fleet_is_told_and_seen_to_oscillate() -> None:
@@ -239,7 +238,7 @@ def test_edges_and_margins_of_one_customer_are_those_of_the_formula() -> None:
 
 def test_steps_end_where_the_inverters_of_the_simulator_rest() -> None:
     site = village()
-    subject, fleet = Subject.of(site), equip(site, "vde4105", Who.ALL)
+    subject, fleet = Subject.of(site), equip(site, "vde4105", Equipped.ALL)
     step = steps(site, 1.06)["tap"]
     x, _ = rest(subject.net, fleet, step.before.p_low + 1j * step.before.q_low, 1.06)
     base = site.feeder.base_kva
@@ -291,7 +290,7 @@ def test_the_band_is_kept_in_all_random_profiles_or_broken_by_the_witness(
 def test_a_jump_breaks_a_band_that_slow_loads_keep() -> None:
     site = village()
     subject, loads = Subject.of(site), box(site, v0_low=1.05, v0_high=1.05)
-    fleet = equip(site, "vde4105", Who.ALL)
+    fleet = equip(site, "vde4105", Equipped.ALL)
     wide = safety(subject, fleet, loads, (0.5, 1.5))
     volts = (wide.low_volt, wide.low_rest_volt)
     assert volts[0] < volts[1] - 1.0
@@ -384,10 +383,10 @@ def test_what_cannot_be_is_said() -> None:
     with refused(FeederInvalid, "nothing-to-design"):
         droop(plain)
     bare = tuple(replace(row, pv_kw=0.0) for row in plain.tables.customers)
-    nobody = from_tables(replace(plain.tables, customers=bare))
+    none = from_tables(replace(plain.tables, customers=bare))
     with refused(FeederInvalid, "nothing-to-design"):
-        droop(nobody, DroopOptions(preset="vde4105"))
-    assert equip(nobody, "vde4105", Who.ALL).tau.size == len(bare)
+        droop(none, DroopOptions(preset="vde4105"))
+    assert equip(none, "vde4105", Equipped.ALL).tau.size == len(bare)
     with refused(InputInvalid, "order"):
         droop(village(), DroopOptions(v_min=1.2))
 

@@ -12,9 +12,8 @@ import pytest
 from feeders.format.tables import FeederTables, LineRow
 from feeders.model.site import Site, from_tables
 from feeders.simulation.plant import ClosedLoop, Loads
-from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged
-from feeders.simulation.powerflow_three_phase import power_flow
-from feeders.studies.droop.fleets import Who, box, equip, made, point
+from feeders.simulation.powerflow import PowerFlow, PowerFlowDiverged, power_flow
+from feeders.studies.droop.fleets import Equipped, box, equip, made, point
 from feeders.studies.droop.limits import (
     BandGuarantee,
     Conditions,
@@ -36,8 +35,8 @@ from feeders.studies.droop.verdict import (
 )
 from feeders.studies.operating import Bases
 from gridsec.arrays import Floats
-from gridsec.grid.droop import Droop
-from gridsec.grid.droop import fleet as fleet_of
+from gridsec.grid.devices import Droop
+from gridsec.grid.devices import fleet as fleet_of
 from gridsec.planning.droop.ac_sensitivity import currents, region, solve
 from gridsec.planning.droop.stability import Update
 from tests.codes import refused
@@ -315,7 +314,7 @@ def test_a_loop_whose_sensitivities_are_negative_is_bounded() -> None:
     subject, loads = Subject.of(site), box(site)
     found, rng = region(subject.net, loads), np.random.default_rng(0)
     assert (site.feeder.R < 0.0).any() or (site.feeder.X < 0.0).any()  # type: ignore[union-attr]
-    fleet = equip(site, "ieee1547-b", Who.ALL)
+    fleet = equip(site, "ieee1547-b", Equipped.ALL)
     kept = safety(subject, fleet, loads, (0.5, 1.5))
     loop = ClosedLoop(subject.flow, fleet, 100.0, 230.0)
     for _ in range(30):

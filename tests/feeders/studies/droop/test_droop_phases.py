@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from feeders.model.site import Site, from_tables, load
-from feeders.simulation.powerflow_three_phase import UnbalancedPowerFlow
-from feeders.studies.droop.fleets import Who, box, equip, point
+from feeders.simulation.powerflow import UnbalancedPowerFlow
+from feeders.studies.droop.fleets import Equipped, box, equip, point
 from feeders.studies.droop.limits import BandGuarantee, Conditions, DroopPlan, checked, ratings_pu, safety
 from feeders.studies.droop.verdict import FleetVerdict, Subject, inverter_rows, judge, longest_interval
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, FeederInvalid
-from gridsec.grid.droop import Droop, voltage_curve
+from gridsec.grid.devices import Droop, voltage_curve
 from gridsec.grid.phased import PhasedFeeder
 from gridsec.planning.droop.ac_sensitivity import InjectionBox, currents, network, region, sensitivity, solve
 from gridsec.planning.droop.equilibrium import always, at_rest, injected, rest
@@ -151,7 +151,7 @@ def test_no_voltage_leaves_its_proven_band() -> None:
     def holds(seed: int) -> None:
         site = random_site(seed, phased=True)
         rng = np.random.default_rng([seed, 2])
-        subject, fleet = Subject.of(site), equip(site, "ieee1547-b", Who.ALL)
+        subject, fleet = Subject.of(site), equip(site, "ieee1547-b", Equipped.ALL)
         loads = random_box(site, rng, 1.0)
         told["drawn"] += 1
         ever = always(subject.net, fleet, loads)
@@ -187,7 +187,7 @@ def test_phases_that_do_not_touch_are_three_fleets() -> None:
     whole, alone = Subject.of(WHOLE), [Subject.of(site) for site in ALONE]
 
     def fleet(site: Site) -> Droop:
-        return equip(site, "vde4105", Who.ALL)
+        return equip(site, "vde4105", Equipped.ALL)
 
     for update in (Update(1.0), Update(60.0), Update(0.0)):
         for at in (lambda site: point(site, 0.3, 1.0, 1.05), box):
@@ -223,7 +223,7 @@ def test_what_one_inverter_may_do_alone_is_still_proved() -> None:
     site = random_site(2, phased=True)
     subject = Subject.of(site)
     at, update = point(site, 0.2, 0.6, 1.04), Update()
-    fleet = enlarged(equip(site, "ieee1547-b", Who.ALL), 0.9)
+    fleet = enlarged(equip(site, "ieee1547-b", Equipped.ALL), 0.9)
     rows = inverter_rows(subject, fleet, update, at, "here")
     made = loop(fleet, reach(subject.net, fleet, at), update)
     assert proof(made).gain < 1.0

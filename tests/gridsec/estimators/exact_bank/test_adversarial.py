@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gridsec.estimators import exact_bank
-from gridsec.grid.droop import Droop, fleet
+from gridsec.grid.devices import Droop, fleet
 from gridsec.interface import Cause, Decision
 from gridsec.observers.certificates import error_bound, reactance
 from gridsec.observers.lure import Lure, close_loop

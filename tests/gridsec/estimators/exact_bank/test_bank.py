@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from gridsec.errors import DesignInfeasible, InputInvalid, NotObservable
 from gridsec.estimators.exact_bank import bank as banks
-from gridsec.grid.droop import Droop
+from gridsec.grid.devices import Droop
 from gridsec.observers.lure import StepPolicy, close_loop
 from gridsec.secure.index import dynamic_index
 from gridsec.secure.subsets import most_attacked

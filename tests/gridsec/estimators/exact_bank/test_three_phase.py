@@ -9,7 +9,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from gridsec.estimators import exact_bank, partial, set_search, thresholds, unknown_input, windowed
+from gridsec.estimators import detection, exact_bank, partial, set_search, unknown_input, windowed
 from gridsec.estimators.exact_bank import bank as banks
 from gridsec.estimators.plant import Plant
 from gridsec.grid.meshed import MeshedFeeder
@@ -83,8 +83,8 @@ class TestPhasesThatDoNotTouch:
         self, monkeypatch: pytest.MonkeyPatch, family: ModuleType, liars: int, lie: dict[int, float]
     ) -> None:
         # Bounds are lowered as far as they go, or each phase would stop where nobody of its own gains much.
-        monkeypatch.setattr(thresholds, "_TIGHTENING", 0.0)
-        monkeypatch.setattr(thresholds, "_ROUNDS", 500)
+        monkeypatch.setattr(detection, "_TIGHTENING", 0.0)
+        monkeypatch.setattr(detection, "_ROUNDS", 500)
         one = meshed(alike(5, 1))
         for answers, whole in watched(family, (one, apart(make_like(one))), liars, lie):
             for k, names in enumerate(

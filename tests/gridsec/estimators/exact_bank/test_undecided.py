@@ -14,7 +14,7 @@ from gridsec.estimators import exact_bank
 from gridsec.estimators.exact_bank import bank as banks
 from gridsec.estimators.exact_bank.step import MonitorDesign, MonitorState
 from gridsec.estimators.plant import Options
-from gridsec.grid.droop import Droop
+from gridsec.grid.devices import Droop
 from gridsec.interface import Cause, Decision, Frame
 from gridsec.observers.certificates import Certificate, certify
 from gridsec.observers.gains import stacked

@@ -12,8 +12,7 @@ from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialOptions, SequentialState
 from gridsec.estimators.sequential.meter_bias import Learned, class_only, from_arrays, to_arrays
-from gridsec.grid.droop import fleet
-from gridsec.grid.meter import MeterAccuracy
+from gridsec.grid.devices import MeterAccuracy, fleet
 from gridsec.interface import Decision, Frame
 from tests.codes import refused
 from tests.gridsec.estimators.sequential.test_monitor import prepare, watch

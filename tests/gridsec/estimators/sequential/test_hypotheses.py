@@ -13,7 +13,6 @@ from gridsec.arrays import Bools, Floats
 from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, hypotheses
-from gridsec.estimators.sequential.fault_dictionary import false_power_charge
 from gridsec.estimators.sequential.hypotheses import HypothesisSearch, _components
 from gridsec.estimators.sequential.posterior import (
     LeaveOneOut,
@@ -22,10 +21,16 @@ from gridsec.estimators.sequential.posterior import (
     condition,
     leave_one_out,
 )
-from gridsec.estimators.sequential.search import Candidate, Candidates, Hypothesis, descend, set_cost
+from gridsec.estimators.sequential.search import (
+    Candidate,
+    Candidates,
+    Hypothesis,
+    descend,
+    false_power_charge,
+    set_cost,
+)
 from gridsec.estimators.sequential.time_scales import Scales, ScaleTest, push, scale_test, update_posterior
-from gridsec.grid.droop import fleet
-from gridsec.grid.meter import MeterAccuracy
+from gridsec.grid.devices import MeterAccuracy, fleet
 from gridsec.grid.network import Power
 from gridsec.grid.radial import Feeder
 from gridsec.interface import Frame
@@ -66,10 +71,10 @@ def search(design: SequentialDesign, m: Floats) -> Candidates:
 
 def prepared(design: SequentialDesign, m: Floats) -> tuple[HypothesisSearch, Posterior, ScaleTest]:
     """The search itself, and what it begins with."""
-    state, everybody = sequential.init(design, 0.0), np.ones(m.size, dtype=np.bool_)
-    window = push(state.window, design.lengths, m, everybody)
+    state, all_meters = sequential.init(design, 0.0), np.ones(m.size, dtype=np.bool_)
+    window = push(state.window, design.lengths, m, all_meters)
     scales = Scales(design, state.uncertainty, window, state.learned, np.zeros(m.size))
-    now = update_posterior(None, scales[0], everybody, None)
+    now = update_posterior(None, scales[0], all_meters, None)
     view = scale_test(design, scales[0], leave_one_out(now, scales[0].m))
     return HypothesisSearch(design, scales, state.full_posteriors, state.trust, 0), now, view
 
@@ -271,7 +276,7 @@ def test_what_is_judged_is_what_each_search_begins_with(
             np.testing.assert_allclose(loo.residual, leave_one_out(start, m).residual)
         return plain(start, m, *rest, loo=loo, **more)
 
-    monkeypatch.setattr(hypotheses.search, "descend", checked)
+    monkeypatch.setattr(hypotheses, "descend", checked)
     found, _ = made(now, view)
     np.testing.assert_array_equal(~found.best.trusted, suspects)
     assert any(told) is not suspected

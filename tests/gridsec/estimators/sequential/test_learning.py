@@ -20,7 +20,7 @@ from gridsec.estimators.sequential import (
     init,
     progress,
 )
-from gridsec.estimators.sequential.frame_uncertainty import nominal
+from gridsec.estimators.sequential.measurements import nominal_uncertainty
 from gridsec.estimators.sequential.meter_bias import (
     COUNTED,
     REASONS,
@@ -215,7 +215,7 @@ def test_an_accused_power_holds_up_all_meters_and_silence_goes_first() -> None:
     every = np.ones(P, dtype=np.bool_)
     frame = street.frame(silent=(ODD,))
     start = no_readings(every, street.t)
-    calm = LearningTick(frame, frame.seen, every, accused=False, uncertainty=nominal(design))
+    calm = LearningTick(frame, frame.seen, every, accused=False, uncertainty=nominal_uncertainty(design))
     silent = ["silent" if k == ODD else None for k in range(P)]
     assert lost(design, start, calm) == (OTHERS.tolist(), silent)
     held = [one or "others-suspected" for one in silent]
@@ -230,7 +230,7 @@ def test_a_meter_with_time_enough_waits_for_suspects() -> None:
     design, street = scene()
     every, frame = np.ones(P, dtype=np.bool_), street.frame()
     start = replace(no_readings(every, street.t), time_s=np.where(OTHERS, NEEDED, 0.0))
-    tick = LearningTick(frame, frame.seen, OTHERS, accused=False, uncertainty=nominal(design))
+    tick = LearningTick(frame, frame.seen, OTHERS, accused=False, uncertainty=nominal_uncertainty(design))
     reason = ["others-suspected" if k != ODD else "suspected" for k in range(P)]
     assert lost(design, start, tick) == (OTHERS.tolist(), reason)
 

@@ -14,8 +14,7 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid
 from gridsec.estimators import sequential
 from gridsec.estimators.sequential import Commission, SequentialDesign, SequentialOptions
-from gridsec.estimators.sequential.frame_uncertainty import nominal as no_doubts
-from gridsec.estimators.sequential.load_uncertainty import LoadDoubt
+from gridsec.estimators.sequential.measurements import nominal_uncertainty as no_doubts
 from gridsec.estimators.sequential.meter_bias import (
     Learned,
     Learning,
@@ -30,7 +29,7 @@ from gridsec.estimators.sequential.meter_bias import (
     renew,
     to_arrays,
 )
-from gridsec.estimators.sequential.posterior import condition, leave_one_out
+from gridsec.estimators.sequential.posterior import LoadDoubt, condition, leave_one_out
 from gridsec.estimators.sequential.time_scales import Scales, empty, scale_test
 from gridsec.interface import Frame
 from tests.codes import refused
@@ -176,8 +175,8 @@ def test_an_honest_meter_not_learned_is_within_its_limit_as_seldom_as_is_said() 
     design, known, residuals = lasting_errors()
     window = empty(design.lengths, P)
     scale = Scales(design, no_doubts(design), window, known, np.zeros(P))[-1]
-    everybody = condition(scale.prior, scale.noise, np.ones(P, dtype=np.bool_))
-    view = scale_test(design, scale, leave_one_out(everybody, scale.m))
+    all_meters = condition(scale.prior, scale.noise, np.ones(P, dtype=np.bool_))
+    view = scale_test(design, scale, leave_one_out(all_meters, scale.m))
     Q = np.linalg.inv(scale.prior.between + np.diag(scale.noise))
     offset = Q[2] @ np.hstack([residuals[:, : 2 * P], np.diag(np.sqrt(design.white / 60))]) / Q[2, 2]
     own = np.arange(3 * P) == P + 2

@@ -12,12 +12,13 @@ from scipy.integrate import solve_ivp
 
 from gridsec.arrays import Floats
 from gridsec.errors import InputInvalid
-from gridsec.estimators.sequential import LoadDoubt, SequentialOptions, design, inverter_check
-from gridsec.estimators.sequential.load_uncertainty import injection_doubt, prior
+from gridsec.estimators.sequential import LoadDoubt, SequentialOptions, design, device_checks
 from gridsec.estimators.sequential.meter_bias import class_only, gather, learn, no_readings
-from gridsec.estimators.sequential.observer import ModelDriven, advance_inverters
+from gridsec.estimators.sequential.observer import advance_inverters
+from gridsec.estimators.sequential.posterior import injection_doubt, voltage_prior
+from gridsec.estimators.sequential.state import ModelDriven
 from gridsec.estimators.sequential.time_scales import empty, forget, push, shift
-from gridsec.grid.droop import fleet
+from gridsec.grid.devices import fleet
 from tests.codes import refused
 from tests.gridsec.street import ac_voltages, accuracy, make_plant, random_tree
 
@@ -29,7 +30,7 @@ class TestLoads:
         tree = random_tree(6, rng, drop=0.004)
         p, q = np.full(6, 0.01), np.full(6, 0.02)
         doubt = LoadDoubt(p, q, 600.0, common_p=0.5, common_q=0.3)
-        found = prior(tree, np.arange(1, 7), doubt, busbar=1e-3)
+        found = voltage_prior(tree, np.arange(1, 7), doubt, busbar=1e-3)
         base = ac_voltages(tree, np.zeros(6, dtype=complex), 1.0) ** 2
         draws = []
         for _ in range(6000):
@@ -48,7 +49,7 @@ class TestLoads:
         tree = random_tree(12, rng, drop=0.04)
         model, doubt = tree.linear(), LoadDoubt(rng.random(12), rng.random(12), 1.0, 0.3, 0.6)
         at, inverters = rng.permutation(13)[:7], rng.random(12)
-        found = prior(tree, at, doubt, busbar=0.01, inverters=inverters)
+        found = voltage_prior(tree, at, doubt, busbar=0.01, inverters=inverters)
         expected = np.full((13, 13), 1e-4)
         for R, s, c in (
             (model.R_bus, doubt.p, 0.3),
@@ -141,7 +142,7 @@ class TestInverters:
         plant = make_plant(rng, customers=4, inverters=np.array([0, 0, 1, 3]), meters=np.array([0, 1, 2]))
         made = design(plant, doubt=LoadDoubt(np.full(4, 0.01), np.full(4, 0.01), 600.0), step_s=1.0)
         np.testing.assert_array_equal(made.meter_of, [0, 0, 1, -1])
-        found = replace(inverter_check.no_checks(3, 4), amount=np.array([0.04, -0.03, 0.5])).amounts(made)
+        found = replace(device_checks.no_checks(3, 4), amount=np.array([0.04, -0.03, 0.5])).amounts(made)
         np.testing.assert_array_equal(found, [0.02, 0.02, -0.03, 0.0])
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import load
-from feeders.registry.registry import design
+from feeders.registry import design
 from feeders.simulation.trial import Trial, TrialMeterErrors, frames
 from gridsec.estimators import sequential
 from gridsec.interface import Decision, Frame

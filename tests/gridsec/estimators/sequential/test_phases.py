@@ -8,20 +8,17 @@ import numpy as np
 import pytest
 
 from feeders.model.equipment import find
-from feeders.model.load_uncertainty import load_doubt
-from feeders.model.site import Site, from_tables, load, one_phase_each
-from feeders.registry.registry import design as design_site
-from feeders.simulation.powerflow_three_phase import power_flow
+from feeders.model.site import Site, from_tables, load, load_doubt, one_phase_each
+from feeders.registry import design as design_site
+from feeders.simulation.powerflow import power_flow
 from feeders.simulation.trial import AttackKind, AttackSpec, LoadError, Trial, TrialMeterErrors, frames
 from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialOptions
-from gridsec.estimators.sequential.load_uncertainty import prior
-from gridsec.grid.droop import Droop
+from gridsec.estimators.sequential.posterior import voltage_prior
+from gridsec.grid.devices import Droop, MeterAccuracy
 from gridsec.grid.meshed import MeshedFeeder, PhasedMesh
-from gridsec.grid.meter import MeterAccuracy
-from gridsec.grid.network import InPhases
-from gridsec.grid.phased import PhasedFeeder
+from gridsec.grid.phased import InPhases, PhasedFeeder
 from gridsec.grid.radial import Feeder
 from gridsec.grid.three_phase import ThreePhaseFeeder
 from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
@@ -199,7 +196,7 @@ def test_balanced_phases_are_the_single_phase_equivalent() -> None:
         np.testing.assert_allclose(found, np.repeat(expected, 3), rtol=0, atol=tolerance)
     # Errors of the loads as well: the mean over a customer's phases is as uncertain as its balanced voltage.
     made = [design_site(site).design for site in (one, three)]
-    priors = [prior(d.plant.feeder, d.prior.meters, d.doubt, busbar=0.0).between for d in made]
+    priors = [voltage_prior(d.plant.feeder, d.prior.meters, d.doubt, busbar=0.0).between for d in made]
     np.testing.assert_allclose(mean @ priors[1] @ mean.T, priors[0], rtol=0, atol=1e-15)
     assert made[1].customers == 3 * made[0].customers
 
@@ -228,7 +225,7 @@ class TestTheEuropeanFeeder:
         other = 0.2 * rng.normal(size=(draws, count))
         v0 = np.full((draws, 3), site.feeder.base_volt)
         v, _ = power_flow(site).solve_batch(known + unknown, 0.2 * known + other, v0)
-        expected = prior(site.feeder, site.feeder.bus, load_doubt(site), busbar=0.0).between
+        expected = voltage_prior(site.feeder, site.feeder.bus, load_doubt(site), busbar=0.0).between
         found = np.cov((v / site.feeder.base_volt) ** 2, rowvar=False)
         assert np.linalg.norm(found - expected) < 0.1 * np.linalg.norm(expected)
         # Phases that share a cable err against each other: that is no neglected rounding.

@@ -11,11 +11,17 @@ import pytest
 
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.sequential import search
-from gridsec.estimators.sequential.fault_dictionary import FaultDictionary
 from gridsec.estimators.sequential.hypotheses import meter_exchanges
-from gridsec.estimators.sequential.load_uncertainty import LoadDoubt, prior
-from gridsec.estimators.sequential.posterior import Prior, condition, leave_one_out
-from gridsec.estimators.sequential.search import Candidate, LimitCache, Limits, descend, robust_set, set_cost
+from gridsec.estimators.sequential.posterior import LoadDoubt, Prior, condition, leave_one_out, voltage_prior
+from gridsec.estimators.sequential.search import (
+    Candidate,
+    FaultDictionary,
+    LimitCache,
+    Limits,
+    descend,
+    robust_set,
+    set_cost,
+)
 from tests.gridsec.street import random_tree
 
 SIGMAS = 3.5
@@ -26,7 +32,7 @@ def street(rng: np.random.Generator, customers: int) -> tuple[Floats, Prior]:
     tree = random_tree(customers, rng, drop=0.04)
     model = tree.linear()
     doubt = LoadDoubt(np.full(customers, 0.006), np.full(customers, 0.002), 600.0)
-    return 2.0 * model.R_bus, prior(tree, np.arange(1, customers + 1), doubt, busbar=4e-4)
+    return 2.0 * model.R_bus, voltage_prior(tree, np.arange(1, customers + 1), doubt, busbar=4e-4)
 
 
 def readings(rng: np.random.Generator, p: Prior, noise: Floats) -> Floats:
@@ -218,8 +224,8 @@ def test_swaps_are_what_the_cost_rises_by() -> None:
     found = descend(condition(p, noise, available), m, available, limits(5), keep=none)
     accused = np.flatnonzero(~found.posterior.trusted)
     assert accused.size >= 1
-    anybody, honest = replace(limits(5), sigmas=1e9), set()
-    everything = meter_exchanges(found, available, 50.0, anybody)
+    any_meter, honest = replace(limits(5), sigmas=1e9), set()
+    everything = meter_exchanges(found, available, 50.0, any_meter)
     for swap in everything:
         trusted = found.posterior.trusted.copy()
         trusted[swap.accused], trusted[swap.innocent] = True, False
@@ -230,7 +236,7 @@ def test_swaps_are_what_the_cost_rises_by() -> None:
         if abs(now.residual[swap.accused]) <= limits(5).limit(now.std)[swap.accused]:
             honest.add(swap.accused)
     assert {swap.accused for swap in meter_exchanges(found, available, 50.0, limits(5))} == honest
-    assert meter_exchanges(found, available, -1.0, anybody) == []
+    assert meter_exchanges(found, available, -1.0, any_meter) == []
 
 
 def test_nobody_is_exchanged_who_would_be_accused_again() -> None:

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from feeders.model.site import load, to_frame
-from feeders.registry.registry import design
+from feeders.registry import design
 from feeders.simulation.scenario import Scenario, simulate, snapshots
 from gridsec.attack import Attack, Replay, Stuck
 from gridsec.estimators.sequential import SuspicionRecord, distrusted, init, warm_start
-from gridsec.estimators.sequential.frame_uncertainty import nominal, update_uncertainty
+from gridsec.estimators.sequential.measurements import nominal_uncertainty, update_uncertainty
 from gridsec.interface import Decision, Frame
 from tests.gridsec.estimators.sequential.test_gaps import LIAR, calm
 from tests.gridsec.estimators.sequential.test_monitor import prepare, watch
@@ -50,7 +50,7 @@ def test_powers_are_in_doubt_as_long_as_residuals_are_remembered_that_were_made_
     made, street = prepare(plant), Street(plant, np.random.default_rng(4))
     rng, frame = np.random.default_rng(5), street.frame()
     known = np.sqrt(3.0) * np.maximum(made.doubt.p, 1e-6)
-    state, ratios = nominal(made), []
+    state, ratios = nominal_uncertainty(made), []
     level = np.ones(3)
     for _ in range(400):
         level = np.where(rng.random(3) < 0.1, np.exp2(rng.integers(0, 10, 3)), level)

@@ -10,7 +10,7 @@ import pytest
 
 from gridsec.estimators import sequential
 from gridsec.estimators.sequential import SequentialDesign
-from gridsec.estimators.sequential.busbar_meter import (
+from gridsec.estimators.sequential.device_checks import (
     BusbarTest,
     BusbarTrust,
     HonestErrors,
@@ -19,11 +19,10 @@ from gridsec.estimators.sequential.busbar_meter import (
     track_busbar,
     trusted_busbar,
 )
-from gridsec.estimators.sequential.error_bounds import PowerErrors
-from gridsec.estimators.sequential.load_uncertainty import prior
+from gridsec.estimators.sequential.measurements import PowerErrors
 from gridsec.estimators.sequential.output import explanations_sentence
-from gridsec.estimators.sequential.posterior import condition, leave_one_out
-from gridsec.grid.meter import busbar_error
+from gridsec.estimators.sequential.posterior import condition, leave_one_out, voltage_prior
+from gridsec.grid.devices import busbar_error
 from gridsec.interface import Cause, Decision, Explanation, Frame
 from tests.gridsec.estimators.sequential.test_monitor import Answers, prepare, watch
 from tests.gridsec.estimators.sequential.test_phases import apart
@@ -68,7 +67,7 @@ class TestOneMore:
     def sigmas(self, m: np.ndarray) -> float:
         """By generalised least squares: what the meters say of the busbar, and what it says itself."""
         design = self.design
-        alone = prior(
+        alone = voltage_prior(
             design.plant.feeder,
             design.prior.meters,
             design.doubt,
@@ -81,8 +80,8 @@ class TestOneMore:
         return said / np.sqrt(1.0 / precision + design.busbar**2)
 
     def test_its_residual_is_that_of_leaving_it_out(self) -> None:
-        everybody, nothing = np.ones(CUSTOMERS, dtype=np.bool_), np.zeros(CUSTOMERS)
-        now = condition(self.design.prior, self.noise, everybody)
+        every, nothing = np.ones(CUSTOMERS, dtype=np.bool_), np.zeros(CUSTOMERS)
+        now = condition(self.design.prior, self.noise, every)
         shift = np.ones(CUSTOMERS)
         # Move all readings until exactly that many standard deviations are reached.
         slope = self.sigmas(self.m + shift) - self.sigmas(self.m)
@@ -120,13 +119,13 @@ class TestOneMore:
         """By the matrices of the linear model: all that errs does so in the worst direction."""
         design, rng = self.design, np.random.default_rng(8)
         plant, model = design.plant, design.plant.feeder.linear()
-        everybody, none = np.ones(CUSTOMERS, dtype=np.bool_), np.zeros(CUSTOMERS, dtype=np.bool_)
-        now, fixed = condition(design.prior, self.noise, everybody), rng.uniform(0.0, 1e-3, CUSTOMERS)
+        every, none = np.ones(CUSTOMERS, dtype=np.bool_), np.zeros(CUSTOMERS, dtype=np.bool_)
+        now, fixed = condition(design.prior, self.noise, every), rng.uniform(0.0, 1e-3, CUSTOMERS)
         errors, nothing = rng.uniform(0.01, 0.05, CUSTOMERS), np.zeros(CUSTOMERS)
         frame = Street(plant, rng).frame()
         p_error, q_error = (errors, nothing) if active else (nothing, errors)
         frame = replace(frame, p_error=p_error, q_error=q_error)
-        powers = PowerErrors(frame, frame.q, none, frame.v0_squared, everybody, design.faults.std)
+        powers = PowerErrors(frame, frame.q, none, frame.v0_squared, every, design.faults.std)
         honest = HonestErrors(powers, np.zeros(plant.droop.tau.size))
         v = now.Q.sum(axis=0) / now.Q.sum()
         moved = 2.0 * (model.R_bus if active else model.X_bus)[design.prior.meters]

@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import given
 
 from gridsec.arrays import Ints
-from gridsec.grid.trees import below, from_root, meetings, walk
+from gridsec.grid.network import below, from_root, meetings, walk
 
 
 def some_tree(seed: int, most: int = 20) -> Ints:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gridsec.estimators.sequential import fault_dictionary as module
-from gridsec.estimators.sequential.fault_dictionary import Sensitivities
-from gridsec.grid.network import Network, Power
+from gridsec.grid import network as module
+from gridsec.grid.network import Network, Power, Sensitivities
 from tests.gridsec.grid.test_network import phased
 from tests.gridsec.meshes import random_mesh
 from tests.gridsec.radial import random_feeder

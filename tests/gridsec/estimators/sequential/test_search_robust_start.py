@@ -13,8 +13,15 @@ from benchmarks.sequential_step import Watched
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.sequential import hypotheses, identify
 from gridsec.estimators.sequential import search as module
-from gridsec.estimators.sequential.load_uncertainty import LoadDoubt, prior
-from gridsec.estimators.sequential.posterior import Posterior, Prior, add_unknown, condition, remove_meter
+from gridsec.estimators.sequential.posterior import (
+    LoadDoubt,
+    Posterior,
+    Prior,
+    add_unknown,
+    condition,
+    remove_meter,
+    voltage_prior,
+)
 from gridsec.estimators.sequential.search import Limits, covers, robust_set
 from gridsec.estimators.sequential.time_scales import ScaleData
 from tests.gridsec.street import random_tree
@@ -26,7 +33,7 @@ def street(rng: np.random.Generator, customers: int) -> Prior:
     """What errors of 0.6 kW do to the voltages of a random tree."""
     tree = random_tree(customers, rng, drop=0.04)
     doubt = LoadDoubt(np.full(customers, 0.006), np.full(customers, 0.002), 600.0)
-    return prior(tree, np.arange(1, customers + 1), doubt, busbar=4e-4)
+    return voltage_prior(tree, np.arange(1, customers + 1), doubt, busbar=4e-4)
 
 
 def readings(rng: np.random.Generator, p: Prior, noise: Floats, lie: float) -> tuple[Floats, Bools]:
@@ -154,7 +161,7 @@ def test_less_is_kept_only_where_more_is_of_no_use() -> None:
     """A fit of all who report takes the place of one of as many or fewer, or of another prior or noise."""
     rng = np.random.default_rng(6)
     p, noise = street(rng, 8), np.full(8, 0.002**2)
-    everybody = np.ones(8, dtype=np.bool_)
+    every = np.ones(8, dtype=np.bool_)
     most = np.arange(8) != 3
 
     def here(enough: Bools, noise: Floats = noise, p: Prior = p) -> ScaleData:
@@ -164,24 +171,24 @@ def test_less_is_kept_only_where_more_is_of_no_use() -> None:
     def kept(before: Posterior | None, now: Posterior, here: ScaleData) -> Posterior | None:
         return identify._kept_posterior(before, None, now, here)
 
-    all_, some = condition(p, noise, everybody), condition(p, noise, most)
-    assert kept(None, all_, here(everybody)) is all_
+    all_, some = condition(p, noise, every), condition(p, noise, most)
+    assert kept(None, all_, here(every)) is all_
     assert kept(None, some, here(most)) is some
-    assert kept(None, some, here(everybody)) is None
-    assert kept(all_, some, here(everybody)) is all_
+    assert kept(None, some, here(every)) is None
+    assert kept(all_, some, here(every)) is all_
     assert kept(all_, some, here(most)) is all_
-    assert kept(some, all_, here(everybody)) is all_
-    assert kept(condition(p, 2.0 * noise, everybody), some, here(most)) is some
+    assert kept(some, all_, here(every)) is all_
+    assert kept(condition(p, 2.0 * noise, every), some, here(most)) is some
     assert (
-        kept(condition(p.with_direction(np.full(p.variance.size, 0.1)), noise, everybody), some, here(most))
+        kept(condition(p.with_direction(np.full(p.variance.size, 0.1)), noise, every), some, here(most))
         is some
     )
-    open_ = condition(p, noise, everybody, np.full((p.variance.size, 1), 0.1))
-    assert kept(None, open_, here(everybody)) is None
-    assert kept(some, open_, here(everybody)) is some
+    open_ = condition(p, noise, every, np.full((p.variance.size, 1), 0.1))
+    assert kept(None, open_, here(every)) is None
+    assert kept(some, open_, here(every)) is some
     # What is of no use any more is not kept either.
-    assert kept(all_, open_, here(everybody, 2.0 * noise)) is None
+    assert kept(all_, open_, here(every, 2.0 * noise)) is None
     changed = all_.copy()
     remove_meter(changed, 3)
     assert kept(None, changed, here(most)) is None
-    assert identify._kept_posterior(some, all_, all_, here(everybody)) is some
+    assert identify._kept_posterior(some, all_, all_, here(every)) is some

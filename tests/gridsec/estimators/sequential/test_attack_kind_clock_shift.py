@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from benchmarks.slow_kinds import Days, Seen, lied, played, read_every, watch
 from feeders.model.site import Site, load
-from feeders.registry.registry import DesignedEstimator, design
+from feeders.registry import DesignedEstimator, design
 from gridsec.arrays import Floats
-from gridsec.estimators.sequential import replay
+from gridsec.estimators.sequential import attack_kind
 from gridsec.interface import ManipulationKind
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -35,7 +35,7 @@ def noise(rng: np.random.Generator, ticks: int) -> Floats:
 
 
 def found(y: Floats, model: Floats, own: Floats | None = None, heard: int = 128) -> int:
-    return replay.clock_shift(y, model, np.zeros_like(y) if own is None else own, heard, ROOM, MOST)
+    return attack_kind.clock_shift(y, model, np.zeros_like(y) if own is None else own, heard, ROOM, MOST)
 
 
 class TestLags:
@@ -50,7 +50,7 @@ class TestLags:
             difference = short - long[stop - n : stop]
             level = np.clip(difference.mean(), -room, room)
             expected.append(np.mean((difference - level) ** 2))
-        np.testing.assert_allclose(replay._lags(short, long, room), expected, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(attack_kind._lags(short, long, room), expected, rtol=1e-9, atol=1e-12)
 
     @given(seed=SEEDS, n=st.integers(6, 40))
     @settings(max_examples=10, deadline=None)
@@ -58,7 +58,7 @@ class TestLags:
         """Oracle: least squares about level and slope, for many parts of a tick between -1/2 and 1/2."""
         rng = np.random.default_rng(seed)
         lie, later = rng.standard_normal(n), rng.standard_normal((2, n - 1))
-        got = replay._in_time(lie, later)
+        got = attack_kind._in_time(lie, later)
 
         def left(lie: Floats) -> float:
             basis = np.vander(np.arange(lie.size), 2)
@@ -84,7 +84,7 @@ class TestShifted:
                 assert found(honest + lie, model, heard=400) == 0
 
     @pytest.mark.parametrize("lag", [-4, -1, 1, 4])
-    @pytest.mark.parametrize("heard", replay.WINDOWS)
+    @pytest.mark.parametrize("heard", attack_kind.WINDOWS)
     def test_single_ticks_from_a_restless_one(self, lag: int, heard: int) -> None:
         for seed in range(5):
             rng = np.random.default_rng(seed)
@@ -126,7 +126,7 @@ class TestShifted:
             ramp = size * np.clip((np.arange(1024) - 300) / (at - 300), 0.0, 1.0)
             stuck = np.where(np.arange(1024) >= 600, honest[600], honest)
             for y in (honest, honest + step, honest + ramp, honest * (1.0 + size), stuck):
-                for heard in replay.WINDOWS:
+                for heard in attack_kind.WINDOWS:
                     assert found(y, model, heard=heard) == 0
 
     def test_what_was_read_before_a_lie_began_is_not_early(self) -> None:
@@ -137,7 +137,7 @@ class TestShifted:
             lie = np.where(np.arange(1100) >= 1050, 0.06, 0.0)
             for now in (1055, 1070, 1100):
                 y, model = ((truth + one + noise(rng, 1100))[:now] for one in (lie, 0.0))
-                for heard in replay.WINDOWS:
+                for heard in attack_kind.WINDOWS:
                     assert found(y, model, heard=heard) == 0
 
     def test_some_readings_may_be_missing_and_not_most(self) -> None:
@@ -145,9 +145,9 @@ class TestShifted:
         truth = walk(rng, 700, 0.01)
         model, y = truth[10:610] + noise(rng, 600), truth[:600] + noise(rng, 600)
         y[rng.random(600) < 0.03] = np.nan
-        assert replay.clock_shift(y, model, np.zeros(600), 128, ROOM, 1e-3) == 10
+        assert attack_kind.clock_shift(y, model, np.zeros(600), 128, ROOM, 1e-3) == 10
         y[-128::3] = np.nan
-        assert replay.clock_shift(y, model, np.zeros(600), 128, ROOM, 1e-3) == 0
+        assert attack_kind.clock_shift(y, model, np.zeros(600), 128, ROOM, 1e-3) == 0
 
 
 def by_definition(y: Floats, model: Floats, own: Floats, heard: int) -> int:
@@ -195,7 +195,7 @@ def test_the_lag_is_that_of_the_definition() -> None:
         own = power[there] if whole else power[here]
         model = others[here] + own + noise(rng, n)
         y = (others + power)[there] + noise(rng, n) + rng.choice([0.0, 0.0, 0.004, 0.05])
-        got = replay.clock_shift(y, model, own, heard, ROOM, MOST)
+        got = attack_kind.clock_shift(y, model, own, heard, ROOM, MOST)
         assert got == by_definition(y, model, own, heard)
         hits[whole] += got != 0
     assert min(hits) > 20

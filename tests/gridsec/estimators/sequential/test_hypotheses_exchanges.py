@@ -10,13 +10,11 @@ import pytest
 from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialOptions
-from gridsec.estimators.sequential.fault_dictionary import FaultDictionary
 from gridsec.estimators.sequential.hypotheses import fault_exchanges
-from gridsec.estimators.sequential.load_uncertainty import LoadDoubt as Doubt
-from gridsec.estimators.sequential.load_uncertainty import prior
-from gridsec.estimators.sequential.posterior import add_unknown, condition, leave_one_out
-from gridsec.estimators.sequential.search import Candidate
-from gridsec.grid.droop import fleet
+from gridsec.estimators.sequential.posterior import LoadDoubt as Doubt
+from gridsec.estimators.sequential.posterior import add_unknown, condition, leave_one_out, voltage_prior
+from gridsec.estimators.sequential.search import Candidate, FaultDictionary
+from gridsec.grid.devices import fleet
 from gridsec.interface import Cause, Decision, Verdict
 from tests.gridsec.street import BASE_KVA, Street, accuracy, make_plant, random_tree
 
@@ -99,7 +97,7 @@ def test_turns_are_what_the_misfit_rises_by() -> None:
     plant = make_plant(rng, customers=10, drop=0.04)
     at = plant.feeder.bus[plant.meters]
     doubt = Doubt(np.full(10, 0.006), np.full(10, 0.002), 600.0)
-    known = prior(plant.feeder, at, doubt, busbar=1e-3)
+    known = voltage_prior(plant.feeder, at, doubt, busbar=1e-3)
     noise, available = np.full(10, 0.01**2), np.ones(10, dtype=bool)
     available[3] = False
     columns = rng.normal(size=(11, 6)) * rng.uniform(0.02, 0.2, 6)

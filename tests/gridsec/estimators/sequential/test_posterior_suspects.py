@@ -9,17 +9,23 @@ import pytest
 from scipy.stats import norm
 
 from feeders.model.site import load
-from feeders.registry.registry import design
+from feeders.registry import design
 from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.scenario import START
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, frames
 from gridsec.arrays import Floats
-from gridsec.estimators.sequential.error_bounds import FALSE_Q
-from gridsec.estimators.sequential.fault_dictionary import Sensitivities
-from gridsec.estimators.sequential.load_uncertainty import LoadDoubt, prior
-from gridsec.estimators.sequential.posterior import Posterior, Prior, add_unknown, condition, leave_one_out
-from gridsec.estimators.sequential.suspect_powers import doubt_powers
-from gridsec.grid.network import Power
+from gridsec.estimators.sequential.posterior import (
+    FALSE_Q,
+    LoadDoubt,
+    Posterior,
+    Prior,
+    add_unknown,
+    condition,
+    doubt_powers,
+    leave_one_out,
+    voltage_prior,
+)
+from gridsec.grid.network import Power, Sensitivities
 from tests.gridsec.street import BASE_KVA, make_plant
 
 CUSTOMERS = 12
@@ -37,7 +43,9 @@ def problem(seed: int) -> tuple[Sensitivities, Posterior, Floats]:
     plant = replace(plant, feeder=replace(plant.feeder, bus=bus))
     doubt = LoadDoubt(np.full(CUSTOMERS, 0.5 / BASE_KVA), np.full(CUSTOMERS, 0.2 / BASE_KVA), 600.0)
     every = np.arange(CUSTOMERS)
-    known: Prior = prior(plant.feeder, plant.feeder.bus, doubt, busbar=1e-4, inverters=np.zeros(CUSTOMERS))
+    known: Prior = voltage_prior(
+        plant.feeder, plant.feeder.bus, doubt, busbar=1e-4, inverters=np.zeros(CUSTOMERS)
+    )
     now = condition(known, 10.0 ** rng.uniform(-7.0, -5.0, CUSTOMERS), ~np.isin(every, (3, 7, 11)))
     sensitivities = Sensitivities(plant.feeder)
     add_unknown(now, sensitivities.columns(Power.ACTIVE, np.array([5]))[:, 0], 0.01)

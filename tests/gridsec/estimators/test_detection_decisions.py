@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gridsec.estimators.decision import Counters, DecisionInputs, count, decide, residual_excess
+from gridsec.estimators.detection import Counters, DecisionInputs, count, decide, residual_excess
 from gridsec.interface import Cause, Decision
 
 FRESH = Counters(np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.intp), np.zeros(1, dtype=bool))

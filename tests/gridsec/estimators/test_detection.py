@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from gridsec.errors import InputInvalid
-from gridsec.estimators import thresholds
-from gridsec.estimators.thresholds import ErrorBound, Motion, TickUncertainty
-from gridsec.grid.droop import PRESETS, fleet
-from gridsec.grid.meter import MeterAccuracy, busbar_error, reading_error
+from gridsec.estimators import detection
+from gridsec.estimators.detection import ErrorBound, Motion, TickUncertainty
+from gridsec.grid.devices import PRESETS, MeterAccuracy, busbar_error, fleet, reading_error
 from tests.codes import refused
 from tests.gridsec.street import make_plant, random_tree
 
@@ -99,7 +98,7 @@ class TestCurveMismatch:
         exact = np.interp(v, droop.v[0], droop.q[0])
         model = droop((1.0 - v**2)[:, None])[:, 0]
         found = np.abs(exact - model).max()
-        assert thresholds.curve_mismatch(droop)[0] == pytest.approx(found, rel=1e-6)
+        assert detection.curve_mismatch(droop)[0] == pytest.approx(found, rel=1e-6)
         assert found > 0
 
 
@@ -108,20 +107,20 @@ class TestLargest:
     def test_against_all_choices(self, seed: int, p: int, count: int) -> None:
         values = np.random.default_rng(seed).uniform(0.0, 1.0, (3, p))
         best = [max(sum(row[list(c)]) for c in combinations(range(p), min(count, p))) for row in values]
-        np.testing.assert_allclose(thresholds.largest(values, count), best, rtol=1e-12, atol=0.0)
+        np.testing.assert_allclose(detection.largest(values, count), best, rtol=1e-12, atol=0.0)
 
 
 def problem(
     rng: np.random.Generator, *, customers: int = 7, M: int = 1
-) -> tuple[thresholds.ErrorModel, TickUncertainty]:
+) -> tuple[detection.ErrorModel, TickUncertainty]:
     plant = make_plant(rng, customers=customers, drop=0.04)
-    model = thresholds.error_model(plant.droop, plant.feeder.linear(), plant.meters, M)
-    nobody = np.zeros(customers, dtype=bool)
+    model = detection.error_model(plant.droop, plant.feeder.linear(), plant.meters, M)
+    empty = np.zeros(customers, dtype=bool)
     now = TickUncertainty(
         base=rng.uniform(0.0, 0.01, customers),
         reading=rng.uniform(0.005, 0.02, customers),
         live=np.ones(customers, dtype=bool),
-        told=nobody,
+        told=empty,
         extra=np.zeros(customers),
     )
     return model, now
@@ -145,7 +144,7 @@ class TestGap:
                 free[list(out)] = True
                 each = np.where(free, bound.free, bound.driven)
                 worst = np.maximum(worst, now.base + model.X2 @ each)
-        np.testing.assert_allclose(thresholds.gap(model, now, bound), worst, rtol=1e-12)
+        np.testing.assert_allclose(detection.gap(model, now, bound), worst, rtol=1e-12)
 
     def test_metered_reactive_power(self) -> None:
         """Trusted: the inverter does not matter. Left out: its error and the load's extra one do."""
@@ -162,18 +161,18 @@ class TestGap:
                 left = np.isin(np.arange(7), out)
                 each = np.where(left, bound.free + extra, np.where(told, 0.0, bound.driven))
                 worst = np.maximum(worst, now.base + model.X2 @ each)
-        np.testing.assert_allclose(thresholds.gap(model, now, bound), worst, rtol=1e-12)
+        np.testing.assert_allclose(detection.gap(model, now, bound), worst, rtol=1e-12)
 
     def test_at_the_inverters(self) -> None:
         rng = np.random.default_rng(2)
         plant = make_plant(rng, customers=6, inverters=np.array([1, 4, 4]), meters=np.array([0, 1, 3, 4, 5]))
-        model = thresholds.error_model(plant.droop, plant.feeder.linear(), plant.meters, 1)
+        model = detection.error_model(plant.droop, plant.feeder.linear(), plant.meters, 1)
         live, none = np.ones(5, dtype=bool), np.zeros(5, dtype=bool)
         now = TickUncertainty(rng.uniform(0.0, 0.01, 6), np.full(5, 0.01), live, none, np.zeros(5))
         bound = ErrorBound(rng.uniform(0.0, 0.01, 3), rng.uniform(0.0, 0.02, 3))
         np.testing.assert_allclose(
-            thresholds.gap(model, now, bound, own=True),
-            thresholds.gap(model, now, bound)[[1, 4, 4]],
+            detection.gap(model, now, bound, own=True),
+            detection.gap(model, now, bound)[[1, 4, 4]],
             rtol=1e-13,
         )
 
@@ -190,7 +189,7 @@ class TestErrorBound:
         plant = make_plant(rng, customers=5, drop=rng.choice([0.02, 0.1]), presets=("ieee1547-b", "vde4105"))
         droop, n = plant.droop, 5
         model = replace(
-            thresholds.error_model(droop, plant.feeder.linear(), plant.meters, 1), mismatch=np.zeros(n)
+            detection.error_model(droop, plant.feeder.linear(), plant.meters, 1), mismatch=np.zeros(n)
         )
         S = 2.0 * plant.feeder.linear().X
         out = rng.choice(n, 2, replace=False)
@@ -207,7 +206,7 @@ class TestErrorBound:
             zeta = np.where(left, w + delta - S @ seen, z + noise)
             return np.concatenate([droop(z) - true, droop(zeta) - seen]) / np.tile(droop.tau, 2)
 
-        bound = level = thresholds.widest(model)
+        bound = level = detection.widest(model)
         before = w + delta - S @ x[n:]
         tight = 0.0
         for _ in range(25):
@@ -215,11 +214,11 @@ class TestErrorBound:
             after = w + delta - S @ x[n:]
             # This observer is itself free of liars: it is as far from the true z as `gap` says, no more.
             motion = Motion(before=before, after=after, offset=np.zeros(n), h=h)
-            bound, level = thresholds.advance(model, now, motion, bound, level)
+            bound, level = detection.advance(model, now, motion, bound, level)
             each = np.where(left, bound.free, bound.driven)
             error = np.abs(x[:n] - x[n:])
             assert (error <= each + 1e-9).all()
-            assert (np.abs(S @ (x[:n] - x[n:]) + delta) <= thresholds.gap(model, now, bound) + 1e-9).all()
+            assert (np.abs(S @ (x[:n] - x[n:]) + delta) <= detection.gap(model, now, bound) + 1e-9).all()
             assert (bound.free <= level.free + 1e-15).all()
             tight = max(tight, float((error / np.maximum(each, 1e-12)).max()))
             before = after
@@ -232,7 +231,7 @@ class TestErrorBound:
         plant = make_plant(rng, customers=5, drop=0.1, presets=("ieee1547-b", "vde4105"))
         droop, h = plant.droop, 900.0
         lin = plant.feeder.linear()
-        model = replace(thresholds.error_model(droop, lin, plant.meters, 1), mismatch=np.zeros(5))
+        model = replace(detection.error_model(droop, lin, plant.meters, 1), mismatch=np.zeros(5))
         S, zero, none = 2.0 * lin.X, np.zeros(5), np.zeros(5, dtype=bool)
         exact = TickUncertainty(zero, zero, ~none, none, zero)
 
@@ -249,7 +248,7 @@ class TestErrorBound:
         true = solve_ivp(rate, (0.0, ago), true, rtol=1e-9, atol=1e-12, max_step=1.0).y[:, -1]
         motion = Motion(before=before, after=jumped - S @ true, offset=zero, h=h)
         start = ErrorBound(zero, zero)
-        bound, _ = thresholds.advance(model, exact, motion, start, thresholds.widest(model))
+        bound, _ = detection.advance(model, exact, motion, start, detection.widest(model))
         # An observer that listens to everybody rests where the last readings put it.
         heard = droop(jumped - S @ true)
         assert (np.abs(true - heard) <= bound.driven + 1e-9).all()
@@ -260,11 +259,11 @@ class TestErrorBound:
         model, now = problem(rng)
         z = np.full(7, 0.05)
         motion = Motion(z, z, np.zeros(7), 1.0)
-        rest = thresholds.settled(model, now, motion, thresholds.widest(model))
-        bound = level = thresholds.widest(model)
+        rest = detection.settled(model, now, motion, detection.widest(model))
+        bound = level = detection.widest(model)
         last = bound.free
         for _ in range(80):
-            bound, level = thresholds.advance(model, now, motion, bound, level)
+            bound, level = detection.advance(model, now, motion, bound, level)
             assert (bound.free <= last + 1e-15).all()
             last = bound.free
         assert (bound.free >= rest.free * (1 - 1e-2)).all()
@@ -276,24 +275,22 @@ class TestErrorBound:
         model, now = problem(rng)
         z = np.full(7, 0.05)
         motion = Motion(z, z, np.zeros(7), 5.0)
-        bound = level = thresholds.settled(model, now, motion, thresholds.widest(model))
+        bound = level = detection.settled(model, now, motion, detection.widest(model))
         worse = replace(now, base=now.base + 0.05)
         for _ in range(30):
-            bound, level = thresholds.advance(model, worse, motion, bound, level)
-        rest = thresholds.settled(model, worse, motion, thresholds.widest(model))
+            bound, level = detection.advance(model, worse, motion, bound, level)
+        rest = detection.settled(model, worse, motion, detection.widest(model))
         np.testing.assert_allclose(bound.free, rest.free, rtol=0.05)
-        assert (
-            bound.free > 1.2 * thresholds.settled(model, now, motion, thresholds.widest(model)).free
-        ).any()
+        assert (bound.free > 1.2 * detection.settled(model, now, motion, detection.widest(model)).free).any()
 
     def test_nothing_moves_inside_the_deadband(self) -> None:
         rng = np.random.default_rng(5)
         tree = random_tree(5, rng, drop=0.01)
         droop = fleet(np.arange(5), "asnzs4777-a", np.full(5, 5.0), 100.0)
-        model = thresholds.error_model(droop, tree.linear(), np.arange(5), 1)
+        model = detection.error_model(droop, tree.linear(), np.arange(5), 1)
         now = TickUncertainty(
             np.full(5, 0.003), np.full(5, 0.015), np.ones(5, dtype=bool), np.zeros(5, dtype=bool), np.zeros(5)
         )
         motion = Motion(np.zeros(5), np.zeros(5), np.zeros(5), 1.0)
-        rest = thresholds.settled(model, now, motion, ErrorBound(np.full(5, 1e-3), np.full(5, 1e-3)))
+        rest = detection.settled(model, now, motion, ErrorBound(np.full(5, 1e-3), np.full(5, 1e-3)))
         np.testing.assert_array_equal(rest.free, model.mismatch)

@@ -14,13 +14,13 @@ from benchmarks.late_powers import site, watcher, world
 from feeders.model.site import Snapshot, to_frame
 from feeders.simulation.scenario import START
 from gridsec.estimators.sequential import init, step
-from gridsec.estimators.sequential.clock_offsets import (
+from gridsec.estimators.sequential.identify import Identification, identify
+from gridsec.estimators.sequential.measurements import (
     largest_offset,
     unusable_offsets,
     update_skew,
     without_shifted_busbar,
 )
-from gridsec.estimators.sequential.identify import Identification, identify
 from gridsec.interface import Cause, Decision
 from tests.gridsec.estimators.sequential.test_monitor import prepare
 from tests.gridsec.street import Street, make_plant

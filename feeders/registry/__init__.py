@@ -1,1 +1,0 @@
-"""Estimators by name, plug-ins, and the cache of designs."""
