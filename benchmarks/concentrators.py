@@ -25,8 +25,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks._arguments import arguments
-from feeders.model.load_uncertainty import load_doubt
-from feeders.model.site import Site, load, plant, to_frame
+from feeders.model.site import Site, load, load_doubt, plant, to_frame
 from feeders.simulation.scenario import Scenario, simulate, snapshots
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators import distributed, sequential
@@ -40,7 +39,7 @@ from gridsec.estimators.distributed import (
     laterals,
     verdict,
 )
-from gridsec.estimators.sequential.load_uncertainty import prior
+from gridsec.estimators.sequential.posterior import voltage_prior
 from gridsec.grid.radial import Feeder
 from gridsec.interface import Frame
 
@@ -96,7 +95,7 @@ class Setting:
             self.feeder, self.site.meters, self.noise, self.doubt, tops=tops, busbar=self.busbar
         )
         buses = np.arange(len(self.feeder.buses))
-        self.covariance = prior(self.feeder, buses, self.doubt, busbar=self.busbar).covariance
+        self.covariance = voltage_prior(self.feeder, buses, self.doubt, busbar=self.busbar).covariance
         self.at = self.feeder.bus[self.site.meters]
         self.bus = {name: k for k, name in enumerate(self.feeder.buses)}
 

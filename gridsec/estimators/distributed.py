@@ -47,9 +47,9 @@ from scipy.special import gammainccinv
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid, Problem, raise_if_any
-from gridsec.estimators.sequential.load_uncertainty import EXACT, UNMETERED, LoadDoubt
+from gridsec.estimators.sequential.posterior import EXACT, UNMETERED, LoadDoubt
+from gridsec.grid.network import below, from_root
 from gridsec.grid.radial import Feeder
-from gridsec.grid.trees import below, from_root
 from gridsec.interface import Decision
 
 FALSE_ALARM: Final = 1e-6

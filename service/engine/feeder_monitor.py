@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from feeders import registry
 from feeders.model.site import PowerAges, Site, to_frame
-from feeders.registry import registry
-from feeders.registry.registry import DesignedEstimator, WarmStart
+from feeders.registry import DesignedEstimator, WarmStart
 from gridsec.estimators.sequential import SuspicionRecord
 from gridsec.interface import Cause
 from service.alarms.conditions import conditions

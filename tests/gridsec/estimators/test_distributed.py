@@ -8,13 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from feeders.model.load_uncertainty import load_doubt
-from feeders.model.site import Site, load
+from feeders.model.site import Site, load, load_doubt
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import InputInvalid
 from gridsec.estimators import distributed
 from gridsec.estimators.distributed import Area, Concentrator, Message, exchange, laterals, partition, verdict
-from gridsec.estimators.sequential.load_uncertainty import LoadDoubt, prior
+from gridsec.estimators.sequential.posterior import LoadDoubt, voltage_prior
 from gridsec.grid.radial import Feeder
 from gridsec.interface import Decision
 
@@ -42,7 +41,7 @@ def drawn(site: Site, noise: Floats, seed: int) -> tuple[Floats, Floats, Floats,
     rng = np.random.default_rng(seed)
     feeder, errors = site.feeder, doubt(site.feeder)
     p, q = -0.02 * rng.random(feeder.bus.size), -0.005 * rng.random(feeder.bus.size)
-    whole = prior(feeder, np.arange(len(feeder.buses)), errors, busbar=BUSBAR).covariance
+    whole = voltage_prior(feeder, np.arange(len(feeder.buses)), errors, busbar=BUSBAR).covariance
     v2 = feeder.bus_voltages(p, q, 1.02) + rng.multivariate_normal(np.zeros(len(whole)), whole, method="eigh")
     y = v2[feeder.bus[site.meters]] + np.sqrt(noise) * rng.normal(size=noise.size)
     return p, q, v2, y
@@ -53,7 +52,7 @@ def central(  # noqa: PLR0917
 ) -> dict[str, Floats]:
     """Posterior of all buses, leave-one-out residuals and chi-square, by dense conditioning."""
     feeder, at = site.feeder, site.feeder.bus[site.meters]
-    S = prior(feeder, np.arange(len(feeder.buses)), doubt(feeder), busbar=BUSBAR).covariance
+    S = voltage_prior(feeder, np.arange(len(feeder.buses)), doubt(feeder), busbar=BUSBAR).covariance
     model = feeder.bus_voltages(p, q, 1.02)
     use = np.flatnonzero(trusted & np.isfinite(y))
     Q = np.linalg.inv(S[np.ix_(at[use], at[use])] + np.diag(noise[use]))

@@ -7,8 +7,7 @@ from contextlib import ExitStack
 
 import numpy as np
 
-from feeders.model.load_uncertainty import load_doubt
-from feeders.model.site import load
+from feeders.model.site import load, load_doubt
 from gridsec.estimators import distributed
 from gridsec.estimators.distributed import Concentrator, exchange, laterals, verdict
 from gridsec.grid.radial import Feeder
