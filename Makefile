@@ -7,7 +7,8 @@ BIN    := $(VENV)/bin
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 # The demo compiles the modules that it imports. All modules of the run time take 12 s and 130 MB more.
-INSTALL := $(BIN)/python -m pip install --no-compile --quiet --disable-pip-version-check
+# A lock file names every package. Resolving it again would let a release of a later day break the installation.
+INSTALL := $(BIN)/python -m pip install --no-deps --no-compile --quiet --disable-pip-version-check
 COMPILE := uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate --no-header \
   --no-emit-index-url --no-emit-find-links
 
@@ -46,7 +47,7 @@ $(VENV)/.installed-demo: requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "gridsec needs Python 3.11 or newer")'
 	$(PYTHON) -m venv $(VENV)
 	$(INSTALL) --require-hashes -r requirements.lock
-	$(INSTALL) --no-deps --no-build-isolation --editable .
+	$(INSTALL) --no-build-isolation --editable .
 	touch $@
 
 # pytest treats warnings as errors, also those of a foreign module's syntax on its first import: all are compiled here.
