@@ -14,9 +14,8 @@ A call to PostgreSQL has a time limit. `OutcomeUnknown` is a commit without an a
 same key again stores it, or finds it stored. After `WriterLost` a store writes nothing more.
 """
 
-from service.store.history import HistoryRules
 from service.store.schema import AlarmEvent, OutcomeUnknown, Rejected, StoreUnavailable, WriterLost
-from service.store.store import BAD_READINGS_KEPT, Store
+from service.store.store import BAD_READINGS_KEPT, HistoryRules, Store
 
 __all__ = [
     "BAD_READINGS_KEPT",

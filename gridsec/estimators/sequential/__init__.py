@@ -7,7 +7,7 @@
 Pipeline of `step`, by module:
 
     measurements   plausibility of the frame, clock offsets, uncertainty of the powers
-    observer       injections of the inverters, voltages by the model (prediction)
+    step           injections of the inverters, voltages by the model (prediction)
     time_scales    running means of the residuals and their limits (detection)
     identify       likeliest sets of manipulated meters by search, hypotheses and device_checks; confirmation
                    by lasting evidence without a likely rival

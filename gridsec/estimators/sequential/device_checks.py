@@ -16,7 +16,7 @@ time. Honest errors explain no more than
 
     |q_net - q - x| <= q_error + q_net_error + e + min(span, d (|residual| + z std)):
 
-e bounds the error of the observed injection x (`gridsec.estimators.sequential.observer`); the last term lets
+e bounds the error of the observed injection x (`gridsec.estimators.sequential.step`); the last term lets
 the inverter follow the voltage by the other meters. Beyond that either the inverter leaves its curve or the
 report is false. The amount ``a = q_net - q - x`` decides by the voltages: if x were true instead of the
 report, the chi-square would rise by

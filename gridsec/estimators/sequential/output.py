@@ -37,7 +37,6 @@ from gridsec.estimators.sequential.measurements import (
     largest_offset,
     unusable_offsets,
 )
-from gridsec.estimators.sequential.observer import Prediction
 from gridsec.estimators.sequential.posterior import (
     DoubtedPowers,
     Prior,
@@ -45,7 +44,7 @@ from gridsec.estimators.sequential.posterior import (
     leave_one_out,
     vouched_posteriors,
 )
-from gridsec.estimators.sequential.state import SequentialState, TrustState
+from gridsec.estimators.sequential.state import Prediction, SequentialState, TrustState
 from gridsec.estimators.sequential.time_scales import min_readings
 from gridsec.grid.devices import told_error
 from gridsec.grid.three_phase import PHASES

@@ -35,6 +35,7 @@ from gridsec.estimators.sequential.measurements import (
     BusbarHistory,
     ClockSkew,
     FrameUncertainty,
+    PowerErrors,
     nominal_uncertainty,
 )
 from gridsec.estimators.sequential.meter_bias import Commission, Learned, Learning, initial
@@ -200,6 +201,18 @@ class ModelDriven:
     rows: Ints  # (k,) inverters
     loop: Lure  # their mutual loop; its input is the effect of all other injections and loads
     transition: LureTransition  # of the loop, for the last step's length
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """One frame by the model. m inverters, n places, p meters."""
+
+    x: Floats  # (m,) injections of the inverters, pu
+    model_driven: ModelDriven | None  # prepared loop of the inverters without a trusted meter
+    injection_error: InjectionError  # errors of the injections
+    powers: PowerErrors  # net injections of the model, and their errors
+    v2_bus: Floats  # (n,) squared voltages, pu
+    transient: Floats  # (p,) remainder of the unknown initial state, squared pu
 
 
 @dataclass(frozen=True, slots=True, eq=False)

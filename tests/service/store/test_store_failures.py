@@ -18,9 +18,9 @@ import sqlalchemy as sa
 
 from service.report.report import FeederReport
 from service.store import Store, StoreUnavailable, WriterLost, connect, schema
-from service.store.history import pack, rows
 from service.store.schema import CommissioningChange, CommissioningEvent
 from service.store.state_codec import SnapshotKind, StateSnapshot
+from service.store.store import pack, rows
 from tests.codes import refused
 from tests.service.databases import Cluster, both
 from tests.service.reports import meter, report

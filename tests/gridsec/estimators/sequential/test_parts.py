@@ -14,9 +14,9 @@ from gridsec.arrays import Floats
 from gridsec.errors import InputInvalid
 from gridsec.estimators.sequential import LoadDoubt, SequentialOptions, design, device_checks
 from gridsec.estimators.sequential.meter_bias import class_only, gather, learn, no_readings
-from gridsec.estimators.sequential.observer import advance_inverters
 from gridsec.estimators.sequential.posterior import injection_doubt, voltage_prior
 from gridsec.estimators.sequential.state import ModelDriven
+from gridsec.estimators.sequential.step import advance_inverters
 from gridsec.estimators.sequential.time_scales import empty, forget, push, shift
 from gridsec.grid.devices import fleet
 from tests.codes import refused
