@@ -16,6 +16,7 @@ import gridsec
 from gridsec.arrays import not_negative
 from gridsec.attack import Bias, Replay, Stuck, coordinate
 from gridsec.estimators import exact_bank, windowed
+from gridsec.estimators.distributed import Message
 from gridsec.estimators.exact_bank import bank
 from gridsec.estimators.plant import Options
 from gridsec.estimators.sequential import LoadDoubt, SequentialOptions
@@ -281,6 +282,7 @@ CALLS: dict[str, Callable[[], Any]] = {
         line(3).lure, rate=0.0, noise=-1.0, load=np.full(3, np.inf), floor=1.0
     ),
     "row of zeros": lambda: linear(np.eye(2), np.ones((2, 1)), np.diag([1.0, 0.0]), np.ones(2)),
+    "boundary message that is not JSON": lambda: Message.from_json("{", 3),
 }
 
 

@@ -492,7 +492,8 @@ class HypothesisSearch:
 
         The surcharge beyond `max_attacked` keeps the estimate on the side of the majority; it is not evidence
         against a manipulated majority. The charge of a suspect's false power beyond one accusation keeps the
-        search from explaining noise; it is not evidence against a device with false voltage and power.
+        search from explaining noise; it is not evidence against a device with false voltage and power. A
+        hypothesis that accuses more meters beside the power keeps the whole charge.
         """
         available = self.here.enough
         ours, theirs = (int(np.count_nonzero(available & ~each.trusted)) for each in (best, other))
@@ -504,6 +505,8 @@ class HypothesisSearch:
         def surcharge(suspects: int) -> float:
             return set_cost(size, suspects, most) - set_cost(size, suspects)
 
+        if theirs > ours:
+            return surcharge(theirs) - surcharge(ours)
         own = np.array([k for k in other.faults if k < self.faults.std.size], dtype=np.intp)
         own = own[self.faults.beside_suspect(own, other.trusted)]
         beyond = np.maximum(self.faults.charges(own, other.trusted, theirs) - 1.0, 0.0)

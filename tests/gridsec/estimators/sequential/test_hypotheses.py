@@ -385,5 +385,6 @@ def test_a_false_power_beside_its_own_suspect_counts_once_between_similar_groups
     assert made.relief(two, of([7, 8], (8,))) == pytest.approx((false_power_charge(2) - 1.0) * one)
     assert made.relief(two, of([7, 8], ())) == 0.0
     assert made.relief(two, of([7, 8], (9,))) == 0.0  # meter 9 is not a suspect
+    assert made.relief(two, of([7, 8, 9], (8,))) == 0.0  # more suspect meters
     assert made.relief(two, of([7, 8, 9, 10], (8,))) == 0.0  # more than twice as many accusations
     assert made.relief(of([3, 4], (4,)), of([7, 8], ())) == 0.0  # the best hypothesis gets none
