@@ -19,16 +19,32 @@ Source: D. Hsu, S. Kakade, T. Zhang, "A tail inequality for quadratic forms of s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.sequential.design import SequentialDesign
+from gridsec.estimators.sequential.measurements import nominal_uncertainty
+from gridsec.estimators.sequential.meter_bias import Learned, Learning, class_only, learn, no_readings
+from gridsec.estimators.sequential.posterior import condition
 from gridsec.estimators.sequential.search import Limits, false_power_charge, set_cost
+from gridsec.estimators.sequential.time_scales import Scales, chi_square_limit, empty
 from gridsec.planning.collusion import Corridor, Shift, corridor, furthest
+from gridsec.planning.unavoidable import AcceptanceRegion
 
-__all__ = ["Rule", "Shift", "largest_shift", "named_size", "rule", "within"]
+__all__ = [
+    "Rule",
+    "Shift",
+    "acceptance_region",
+    "honest_covariance",
+    "largest_shift",
+    "learned_scales",
+    "named_size",
+    "rule",
+    "within",
+]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,3 +191,75 @@ def _worst(own: float, gain: Floats, cost: Floats, budget: float) -> float:
         best = max(best, (total + slope * u) * (budget - spent - u))
         total, spent = total + gain[k], spent + cost[k]
     return best
+
+
+# --- All tests of the monitor together ---
+
+
+def learned_scales(design: SequentialDesign, *, learned: bool, model: Floats) -> Scales:
+    """Scales of the monitor with all meters trusted and powers as the design expects them.
+
+    design: the monitor.
+    learned: fixed errors are known as well as after `commission_s` without a pause; else by their class.
+    model (p,): error of the model, squared pu.
+    """
+    known, duration_s = class_only(design), design.options.commission_s
+    if learned and duration_s > 0.0:
+        every = np.ones(model.size, dtype=np.bool_)
+        known = learn(design, known, _gathered(design, every, duration_s), every, duration_s).learned
+    window = empty(design.lengths, model.size)
+    return Scales(design, nominal_uncertainty(design), window, known, model)
+
+
+def _gathered(design: SequentialDesign, every: Bools, duration_s: float) -> Learning:
+    """Sums of a commissioning of residuals zero: variances do not depend on the residuals."""
+    count = np.full(every.size, max(1, round(duration_s / design.step_s)))
+    return replace(no_readings(every, 0.0), count=count, time_s=np.full(every.size, duration_s))
+
+
+def acceptance_region(
+    scales: Scales, *, misfit: bool = True, busbar: bool = True, levels: Sequence[float] | None = None
+) -> AcceptanceRegion:
+    """Displacements of all residuals that no test of the monitor rejects, all meters trusted.
+
+    The limit of the misfit is that of ``sqrt(m' Q m)``: with the honest part of m it is at most the sum of
+    both roots.
+
+    scales: the scales at one moment.
+    misfit, busbar: use the tests of the misfit and of the busbar's meter.
+    levels (s,): largest mean of the displacement on each scale, as a part of its largest value; None for a
+        constant displacement. A scale of level 0 does not test.
+    """
+    design, model = scales.design, scales.model
+    every = np.ones(model.size, dtype=np.bool_)
+    rows, forms = [], []
+    for s, level in enumerate([1.0] * len(design.lengths) if levels is None else levels):
+        if level <= 0.0:
+            continue
+        here = scales[s]
+        now = condition(here.prior, here.noise, every)
+        Q, std = now.Q, np.sqrt(1.0 / now.diagonal())
+        rows.append(level * Q * (std**2 / here.limits.limit(std))[:, None])
+        if misfit:
+            root = np.sqrt(chi_square_limit(model.size, design.tails[s])) + np.sqrt(model @ np.abs(Q) @ model)
+            forms.append(level * np.linalg.cholesky(Q).T / root)
+        if busbar:
+            incidence = design.busbar_incidence
+            together = incidence.T @ Q
+            form = np.sqrt(np.einsum("bp,pb->b", together, incidence))
+            some = form > 0.0
+            rows.append(level * together[some] / (design.sigmas[s] * form[some])[:, None])
+    last = scales[len(design.lengths) - 1]
+    gain = condition(last.prior, last.noise, every)
+    return AcceptanceRegion(np.vstack(rows), tuple(forms), last.prior.covariance @ gain.Q)
+
+
+def honest_covariance(scales: Scales, ticks: int) -> tuple[Floats, Floats]:
+    """Covariance of a mean of honest residuals, (p, p), and that of the places' voltages with it, (n, p).
+
+    scales: the scales at one moment.
+    ticks: length of the mean, with all readings.
+    """
+    design, prior = scales.design, scales[len(scales.design.lengths) - 1].prior
+    V = prior.between + np.diag(scales.learned.variance + design.white / ticks)
+    return V, prior.covariance
