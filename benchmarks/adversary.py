@@ -82,12 +82,11 @@ from gridsec.interface import Decision, Frame
 from gridsec.planning.detectability import acceptance_region, honest_covariance
 from gridsec.planning.unavoidable import (
     AcceptanceRegion,
+    ConeProgram,
     Faults,
-    Hidden,
     blind_norm,
     deviations,
     every_test,
-    programs,
     unavoidable,
 )
 
@@ -284,9 +283,10 @@ class Scene:
         errors = unavoidable(V, prior, self.faults, z)
         if self.kind.powers:
             # Some combinations are nearly invisible: ranges of the powers limit them.
-            program, errors = programs(every_test(V, prior, z), self.faults), np.zeros_like(errors)
+            region, errors = every_test(V, prior, z), np.zeros_like(errors)
+            program, gain = ConeProgram(region, self.faults), self.faults.gain(region.weights)
             for x in np.unique(self.made.prior.meters[self.meters]):
-                errors[x] = program(int(x), 1.0).error
+                errors[x] = program(gain[x]).size
         return errors, blind_norm(self.faults.signature.shape[1], z) / z
 
     def region(self, pattern: Pattern) -> AcceptanceRegion:
@@ -309,10 +309,11 @@ class Scene:
             yield 1.0, at * ((1.0 - SPIKE) ** 2 - 1.0)
             return
         size = np.max([errors for errors, _ in self.minima], axis=0)
-        program = programs(self.region(pattern), self.faults)
+        region = self.region(pattern)
+        program, gain = ConeProgram(region, self.faults), self.faults.gain(region.weights)
         for share in SHARES:
-            found: list[Hidden] = [program(int(x), share) for x in np.argsort(-size)[:TARGETS]]
-            yield share, max(found, key=lambda one: one.error).amounts
+            found = [program(gain[x], share) for x in np.argsort(-size)[:TARGETS]]
+            yield share, max(found, key=lambda one: one.size).amounts
 
     def play(self, pattern: Pattern, share: float, amounts: Floats) -> Played:
         """Play one attack."""

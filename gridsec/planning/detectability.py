@@ -32,11 +32,14 @@ from gridsec.estimators.sequential.posterior import condition
 from gridsec.estimators.sequential.search import Limits, false_power_charge, set_cost
 from gridsec.estimators.sequential.time_scales import Scales, chi_square_limit, empty
 from gridsec.planning.collusion import Corridor, Shift, corridor, furthest
-from gridsec.planning.unavoidable import AcceptanceRegion
+from gridsec.planning.unavoidable import AcceptanceRegion, ConeProgram, Faults, deviations
 
 __all__ = [
+    "ROOM",
+    "MonitorTests",
     "Rule",
     "Shift",
+    "Threshold",
     "acceptance_region",
     "honest_covariance",
     "largest_shift",
@@ -263,3 +266,79 @@ def honest_covariance(scales: Scales, ticks: int) -> tuple[Floats, Floats]:
     design, prior = scales.design, scales[len(scales.design.lengths) - 1].prior
     V = prior.between + np.diag(scales.learned.variance + design.white / ticks)
     return V, prior.covariance
+
+
+ROOM = 0.2
+"""Part of every limit for honest residuals: 1.2 standard deviations of a Gaussian one; measured, 0.15."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Threshold:
+    """Size of an attack at which the monitor stops being CLEAN. All sizes squared pu.
+
+    undetected: reached by `lies`; every statistic is at most ``1 - ROOM`` of its limit.
+    found: every larger attack by as many meters has a statistic beyond ``1 + ROOM`` of its limit.
+    unavoidable: no test with the same rate of false alarms detects up to this size, by the meters of `lies`, at
+        least every second time. For an error of a reconstruction it is the error of that size.
+    """
+
+    undetected: float
+    found: float
+    unavoidable: float
+    lies: Floats  # (p,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MonitorTests:
+    """All tests of the monitor at one moment. n places, p meters."""
+
+    region: AcceptanceRegion
+    reach: Floats  # (p,) largest attack on each meter in any collusion, squared pu
+    covariance: Floats  # (p, p) V of honest residuals over the longest scale
+    prior: Floats  # (n, p) covariance of the places' voltages with the residuals
+    z: float  # standard deviations of one test of the longest scale, with the monitor's rate of false alarms
+
+    @staticmethod
+    def of(scales: Scales) -> MonitorTests:
+        """Tests of a moment, with all meters trusted."""
+        design = scales.design
+        region = acceptance_region(scales)
+        p, last = scales.model.size, design.lengths[-1]
+        covariance, prior = honest_covariance(scales, last)
+        # |a| <= |R_s^-1| |R_s a| on each scale, and a' Q a <= 1 bounds a_j by the root of (Q^-1)_jj.
+        step = p + design.busbar_incidence.shape[1]
+        blocks = [region.rows[k : k + p] for k in range(0, len(region.rows), step)]
+        linear = [np.abs(np.linalg.inv(block)).sum(axis=1) for block in blocks]
+        norms = [np.linalg.norm(np.linalg.inv(form), axis=1) for form in region.forms]
+        z = deviations(design.options.alarms_per_year, last * design.step_s)
+        return MonitorTests(region, np.min([*linear, *norms], axis=0), covariance, prior, z)
+
+    def corridor(self, liars: int) -> Corridor:
+        """Linear tests for at most M manipulated meters, for `threshold`."""
+        return corridor(self.region.rows, liars, reach=self.reach)
+
+    def threshold(self, within_: Corridor, along: Floats, *, must: int | None = None) -> Threshold:
+        """Threshold of attacks along a direction.
+
+        within_: of `corridor`.
+        along (p,): a unit vector for the attack on one meter, or the weights of a reconstruction.
+        must: a meter that is manipulated in any case.
+        """
+        linear = furthest(within_, along, must=must)
+        meters = np.flatnonzero(linear.lies)
+        if not meters.size:
+            return Threshold(0.0, (1.0 + ROOM) * linear.bound, 0.0, np.zeros(along.size))
+        faults = Faults.voltages(meters, self.prior.shape, np.inf)
+        # Finite ranges: no lie is beyond the reach.
+        faults = replace(faults, least=-self.reach[meters], most=self.reach[meters])
+        hidden = ConeProgram(self.region, faults)(along[meters], 1.0 - ROOM)
+        lies = np.zeros(along.size)
+        lies[meters] = hidden.amounts
+        least = _largest_effect(self.covariance, faults, along[meters], self.z)
+        return Threshold(hidden.size, (1.0 + ROOM) * linear.bound, least, lies)
+
+
+def _largest_effect(covariance: Floats, faults: Faults, along: Floats, z: float) -> float:
+    """``z sqrt(g F^-1 g')`` of `gridsec.planning.unavoidable` for one effect g (q,)."""
+    F = faults.signature.T @ np.linalg.solve(covariance, faults.signature)
+    return z * float(np.sqrt(along @ np.linalg.solve(F, along)))

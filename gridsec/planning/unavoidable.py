@@ -28,9 +28,7 @@ docs/theory-studies.md, section 7.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -44,13 +42,12 @@ from gridsec.estimators.sequential.design import YEAR_S
 
 __all__ = [
     "AcceptanceRegion",
+    "ConeProgram",
     "Faults",
     "Hidden",
     "blind_norm",
     "deviations",
     "every_test",
-    "hidden_error",
-    "programs",
     "unavoidable",
 ]
 
@@ -127,26 +124,23 @@ class AcceptanceRegion:
     def statistic(self, displacement: Floats) -> float:
         """Largest statistic of a displacement (p,) of the residuals, in units of its limit."""
         linear = float(np.abs(self.rows @ displacement).max(initial=0.0))
-        return max(linear, *(float(np.linalg.norm(form @ displacement)) for form in self.forms), 0.0)
+        return max([linear, *(float(np.linalg.norm(form @ displacement)) for form in self.forms)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hidden:
-    """Largest hidden error at one place. q faults.
+    """Largest hidden effect. q faults.
 
     Attributes
     ----------
-    place
-        x.
     amounts : (q,)
         theta.
-    error
-        ``g_x theta``, squared pu.
+    size
+        ``g theta``.
     """
 
-    place: int
     amounts: Floats
-    error: float
+    size: float
 
 
 def deviations(alarms_per_year: float, seconds: float) -> float:
@@ -224,72 +218,66 @@ def every_test(covariance: Floats, prior: Floats, z: float) -> AcceptanceRegion:
     return AcceptanceRegion(np.zeros((0, len(half))), (white / z,), prior @ white.T @ white)
 
 
-def hidden_error(tests: AcceptanceRegion, faults: Faults, place: int, *, share: float = 1.0) -> Hidden:
-    """Largest error at one place that all tests leave hidden.
+class ConeProgram:
+    """Largest effect of a coalition's faults that all tests leave hidden.
 
     Parameters
     ----------
     tests, faults
         The tests, and the coalition's faults.
-    place
-        x.
-    share
-        Part of every limit that the displacement uses; the rest is the room of honest residuals.
-
-    Raises
-    ------
-    DesignInfeasible
-        If the solver fails.
     """
-    return _Program(tests, faults)(place, share)
-
-
-class _Program:
-    """The cone program of tests and faults, for any place."""
 
     def __init__(self, tests: AcceptanceRegion, faults: Faults) -> None:
-        self.gain, self.faults = faults.gain(tests.weights), faults
+        self.faults = faults
         rows, forms = tests.rows @ faults.signature, [form @ faults.signature for form in tests.forms]
         # A form counts by its triangular factor: q rows in place of p.
         forms = [np.linalg.qr(form, mode="r") if len(form) > form.shape[1] else form for form in forms]
-        largest = np.max([np.abs(rows).max(axis=0, initial=0.0), *(np.linalg.norm(f, axis=0) for f in forms)], axis=0)
-        self.unit = 1.0 / np.maximum(largest, np.finfo(np.float64).tiny)
+        largest = np.abs(rows).max(axis=0, initial=0.0)
+        for form in forms:
+            largest = np.maximum(largest, np.linalg.norm(form, axis=0))
+        self.unit = 1.0 / np.maximum(largest, _INVISIBLE)
         self.rows, self.forms = rows * self.unit, [form * self.unit for form in forms]
 
-    def __call__(self, place: int, share: float) -> Hidden:
+    def __call__(self, effect: Floats, share: float = 1.0) -> Hidden:
+        """Faults with the largest effect.
+
+        Parameters
+        ----------
+        effect : (q,)
+            g: a row of `Faults.gain`, or a unit vector for the size of one fault.
+        share
+            Part of every limit that the displacement uses; the rest is the room of honest residuals.
+
+        Raises
+        ------
+        DesignInfeasible
+            If the solver fails.
+        """
         import clarabel
 
-        solver: Any = clarabel
-        g, unit, (least, most) = self.gain[place] * self.unit, self.unit, (self.faults.least, self.faults.most)
-        eye, nothing = np.eye(g.size), np.zeros((1, g.size))
-        A = [self.rows, -self.rows, eye, -eye]
-        b = [np.full(2 * len(self.rows), share), most / unit, -least / unit]
-        cones = [solver.NonnegativeConeT(2 * len(self.rows) + 2 * g.size)]
-        for form in self.forms:
-            A += [nothing, -form]
-            b += [np.array([share]), np.zeros(len(form))]
-            cones.append(solver.SecondOrderConeT(1 + len(form)))
-        settings = solver.DefaultSettings()
-        settings.verbose, settings.tol_gap_rel, settings.tol_feas = False, _EXACT, _EXACT
-        scale = float(np.abs(g).max())
+        g, least, most = effect * self.unit, self.faults.least / self.unit, self.faults.most / self.unit
+        scale = float(np.abs(g).max(initial=0.0))
         if scale == 0.0:
-            return Hidden(place, np.zeros(g.size), 0.0)
-        zero = csc_array((g.size, g.size))
-        found = solver.DefaultSolver(zero, -g / scale, csc_array(np.vstack(A)), np.concatenate(b), cones, settings)
-        found = found.solve()
+            return Hidden(np.zeros(g.size), 0.0)
+        eye, r = np.eye(g.size), len(self.rows)
+        A, b = [self.rows, -self.rows, eye, -eye], [np.full(2 * r, share), most, -least]
+        cones = [clarabel.NonnegativeConeT(2 * r + 2 * g.size)]
+        for form in self.forms:
+            A += [np.zeros((1, g.size)), -form]
+            b += [np.array([share]), np.zeros(len(form))]
+            cones.append(clarabel.SecondOrderConeT(1 + len(form)))
+        settings = clarabel.DefaultSettings()
+        settings.verbose, settings.tol_gap_rel, settings.tol_feas = False, _EXACT, _EXACT
+        whole = csc_array(np.vstack(A)), np.concatenate(b), cones, settings
+        found = clarabel.DefaultSolver(csc_array((g.size, g.size)), -g / scale, *whole).solve()
         x = np.array(found.x)
         if "Solved" not in str(found.status) or not np.isfinite(x).all():
-            raise DesignInfeasible("cone program of a hidden error", str(found.status), code="no-solution")
-        x = self._feasible(np.clip(x, least / unit, most / unit), share)
-        return Hidden(place, x * unit, float(g @ x))
+            raise DesignInfeasible("largest hidden error", str(found.status), code="no-solution")
+        x = np.clip(x, least, most)
+        x /= max(self._statistic(x) / share, 1.0)
+        return Hidden(x * self.unit, float(g @ x))
 
-    def _feasible(self, x: Floats, share: float) -> Floats:
-        """The point, without the solver's rounding beyond a bound."""
-        norms = (float(np.linalg.norm(form @ x)) for form in self.forms)
-        over = max(float(np.abs(self.rows @ x).max(initial=0.0)), *norms, 0.0) / share
-        return x / max(over, 1.0)
-
-
-def programs(tests: AcceptanceRegion, faults: Faults) -> Callable[[int, float], Hidden]:
-    """As `hidden_error`, prepared for several places: called with a place and a share."""
-    return _Program(tests, faults)
+    def _statistic(self, x: Floats) -> float:
+        """Largest statistic, in units of its limit: the solver's rounding may exceed one."""
+        linear = float(np.abs(self.rows @ x).max(initial=0.0))
+        return max([linear, *(float(np.linalg.norm(form @ x)) for form in self.forms)])
