@@ -69,7 +69,9 @@ class World:
     @property
     def monitor(self) -> DesignedEstimator:
         """The default monitor, without commissioning of its own."""
-        return _aged_watcher(self.setting.feeder) if self.aged else watcher(self.setting.feeder, Model.MATCHED)
+        return (
+            _aged_watcher(self.setting.feeder) if self.aged else watcher(self.setting.feeder, Model.MATCHED)
+        )
 
     def frames(self, duration_s: float) -> Iterator[tuple[Frame, Floats]]:
         """Honest frames and true squared voltages, (N,), from `START` on."""
@@ -212,7 +214,9 @@ class Shadow:
 @lru_cache(maxsize=16)
 def _followed(world: World, kernel: Core) -> CoreState:
     """The core after the learning run."""
-    made = watcher(world.setting.feeder, Model.MATCHED, step_s=LEARN_STEP_S, commission_s=2.0 * LEARN_S).design
+    made = watcher(
+        world.setting.feeder, Model.MATCHED, step_s=LEARN_STEP_S, commission_s=2.0 * LEARN_S
+    ).design
     begin = START - LEARN_S - 2.0 * LEARN_STEP_S
     front, state = sequential.init(made, begin), core.init(kernel, begin)
     for frame, _ in play(world.setting, LEARN_S, step_s=LEARN_STEP_S, start=begin):

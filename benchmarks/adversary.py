@@ -335,7 +335,9 @@ class Scene:
             minimum = float(errors.max()) * _volt(volt)
             if moved.max() / minimum > worst.ratio:
                 factors = minimum, blind * minimum
-                worst = replace(worst, error=float(moved.max()), minimum=factors[0], blind=factors[1], age=age)
+                worst = replace(
+                    worst, error=float(moved.max()), minimum=factors[0], blind=factors[1], age=age
+                )
         liars = np.isin(np.arange(named.size), self.meters)
         counts = int((named & liars).sum()), int((named & ~liars).sum())
         part = 100.0 * clean / kind.ticks
@@ -358,9 +360,7 @@ class Scene:
 
     def _false(self, frame: Frame, amounts: Floats) -> Frame:
         kind = self.kind
-        return falsified(
-            frame, self.made, self.meters, amounts, powers=kind.powers, busbar=kind.busbar
-        )
+        return falsified(frame, self.made, self.meters, amounts, powers=kind.powers, busbar=kind.busbar)
 
     def _learned(self, amounts: Callable[[int], Floats] | None) -> object:
         """State of the monitor after six hours of learning under the attack; meters it names stay out."""

@@ -249,7 +249,9 @@ def _customer(given: _Given, i: int) -> dict[str, Any]:
     site, liars = given.site, given.max_attacked
     bus, base = int(site.feeder.bus[i]), site.customer_volt[i]
     moved = furthest(given.corridors[True, liars], given.rule.weights(bus)).bound
-    learned = given.tests.threshold(given.learned[liars], given.tests.region.weights[bus])
+    # At the busbar the monitor shows the reading of its meter.
+    own = float(bus >= site.feeder.busbar_places().stop)
+    learned = given.tests.threshold(given.learned[liars], own * given.tests.region.weights[bus])
     return {
         "customer": site.feeder.customers[i],
         "bus": site.feeder.buses[bus],
