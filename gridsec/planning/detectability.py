@@ -30,7 +30,7 @@ from gridsec.estimators.sequential.measurements import nominal_uncertainty
 from gridsec.estimators.sequential.meter_bias import Learned, Learning, class_only, learn, no_readings
 from gridsec.estimators.sequential.posterior import condition
 from gridsec.estimators.sequential.search import Limits, false_power_charge, set_cost
-from gridsec.estimators.sequential.time_scales import Scales, chi_square_limit, empty
+from gridsec.estimators.sequential.time_scales import Scales, chi_square_limit, empty, score_limit, scored
 from gridsec.planning.collusion import Corridor, Shift, corridor, furthest
 from gridsec.planning.unavoidable import AcceptanceRegion, ConeProgram, Faults, deviations
 
@@ -244,7 +244,11 @@ def acceptance_region(
         Q, std = now.Q, np.sqrt(1.0 / now.diagonal())
         rows.append(level * Q * (std**2 / here.limits.limit(std))[:, None])
         if misfit:
-            root = np.sqrt(chi_square_limit(model.size, design.tails[s])) + np.sqrt(model @ np.abs(Q) @ model)
+            error, tail = np.sqrt(model @ np.abs(Q) @ model), design.tails[s]
+            if scored(design):
+                tail = 0.5 * tail
+                rows.append(level * _scores(design, Q) / (score_limit(design.customers, tail) + error))
+            root = np.sqrt(chi_square_limit(model.size, tail)) + error
             forms.append(level * np.linalg.cholesky(Q).T / root)
         if busbar:
             incidence = design.busbar_incidence
@@ -255,6 +259,14 @@ def acceptance_region(
     last = scales[len(design.lengths) - 1]
     gain = condition(last.prior, last.noise, every)
     return AcceptanceRegion(np.vstack(rows), tuple(forms), last.prior.covariance @ gain.Q)
+
+
+def _scores(design: SequentialDesign, Q: Floats) -> Floats:
+    """Scores of the customers' active powers per displacement, standard deviations, (k, p)."""
+    columns = design.faults.columns(np.arange(design.customers))[design.prior.meters]
+    information = np.einsum("pk,pk->k", columns, Q @ columns)
+    some = information > np.finfo(np.float64).tiny
+    return np.asarray((columns[:, some].T @ Q) / np.sqrt(information[some])[:, None])
 
 
 def honest_covariance(scales: Scales, ticks: int) -> tuple[Floats, Floats]:
@@ -306,8 +318,8 @@ class MonitorTests:
         p, last = scales.model.size, design.lengths[-1]
         covariance, prior = honest_covariance(scales, last)
         # |a| <= |R_s^-1| |R_s a| on each scale, and a' Q a <= 1 bounds a_j by the root of (Q^-1)_jj.
-        step = p + design.busbar_incidence.shape[1]
-        blocks = [region.rows[k : k + p] for k in range(0, len(region.rows), step)]
+        step = len(region.rows) // len(design.lengths)
+        blocks = [region.rows[k * step : k * step + p] for k in range(len(design.lengths))]
         linear = [np.abs(np.linalg.inv(block)).sum(axis=1) for block in blocks]
         norms = [np.linalg.norm(np.linalg.inv(form), axis=1) for form in region.forms]
         z = deviations(design.options.alarms_per_year, last * design.step_s)

@@ -144,7 +144,7 @@ class Hidden:
 
 
 def deviations(alarms_per_year: float, seconds: float) -> float:
-    """z of a test that looks once in a period, one-sided, with a rate of false alarms.
+    """Limit z of a test that looks once in a period, one-sided, with a rate of false alarms.
 
     Parameters
     ----------
@@ -231,7 +231,7 @@ class ConeProgram:
         self.faults = faults
         rows, forms = tests.rows @ faults.signature, [form @ faults.signature for form in tests.forms]
         # A form counts by its triangular factor: q rows in place of p.
-        forms = [np.linalg.qr(form, mode="r") if len(form) > form.shape[1] else form for form in forms]
+        forms = [np.asarray(np.linalg.qr(form, mode="r")) if len(form) > form.shape[1] else form for form in forms]
         largest = np.abs(rows).max(axis=0, initial=0.0)
         for form in forms:
             largest = np.maximum(largest, np.linalg.norm(form, axis=0))

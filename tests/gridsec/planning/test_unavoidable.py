@@ -14,7 +14,7 @@ from gridsec.errors import InputInvalid
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, design
 from gridsec.estimators.sequential.posterior import condition, leave_one_out
-from gridsec.estimators.sequential.time_scales import Scales, inconsistent, scale_test
+from gridsec.estimators.sequential.time_scales import Scales, inconsistent, load_scores, scale_test
 from gridsec.grid.devices import MeterAccuracy, fleet
 from gridsec.planning.detectability import (
     ROOM,
@@ -62,7 +62,8 @@ def told(scales: Scales, displacement: Floats) -> bool:
         view = scale_test(made, here, leave_one_out(now, displacement))
         if (np.abs(view.loo.residual) > view.limit).any():
             return True
-        if inconsistent(now, view.loo, scales.model, made.tails[s]):
+        scores = load_scores(made, now, None, view.loo)
+        if inconsistent(now, view.loo, scales.model, made.tails[s], scores):
             return True
         d = made.busbar_incidence[:, 0]
         weights = now.Q @ displacement
@@ -209,7 +210,7 @@ def test_thresholds_equal_enumeration(seed: int) -> None:
         assert np.count_nonzero(pair.lies) <= 2
         assert not told(scales, pair.lies / (1.0 - ROOM) * (1 - 1e-6))
     error = tests.threshold(tests.corridor(2), tests.region.weights[tests.region.weights.any(axis=1)][0])
-    assert 0.0 < error.unavoidable
+    assert error.unavoidable > 0.0
     assert error.undetected < error.found
     assert prior.shape == tests.region.weights.shape
     none = tests.threshold(tests.corridor(1), np.zeros(METERS))
