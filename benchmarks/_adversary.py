@@ -12,7 +12,7 @@ are played with the attacks made for the default monitor.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import log
@@ -29,7 +29,7 @@ from gridsec.estimators import sequential
 from gridsec.estimators.modal import core, detector, estimate, signatures
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.sequential import SequentialDesign, SequentialState
-from gridsec.estimators.sequential.meter_bias import Learned
+from gridsec.estimators.sequential.meter_bias import Learned, class_only
 from gridsec.estimators.sequential.time_scales import Scales
 from gridsec.grid.network import Power
 from gridsec.interface import Decision, Frame
@@ -137,8 +137,8 @@ class Registered:
         self.design = world.monitor if name == SEQUENTIAL else _other(name, world)
         self.default = name == SEQUENTIAL
 
-    def start(self, known: Learned | None) -> Any:
-        """State before the first frame."""
+    def start(self, known: Learned | None, learning: Iterable[Frame]) -> Any:  # noqa: ARG002  # as `Shadow`
+        """State before the first frame, with what the default monitor learned."""
         if self.default:
             return sequential.init(self.design.design, START, known)
         return self.design.init(START)
@@ -185,12 +185,16 @@ class Shadow:
         self.core: Core = core.design(self.front, kw / world.site.feeder.base_kva)
         self.world = world
 
-    def start(self, known: Learned | None) -> Both:
-        """State before the first frame; the core has followed the learning run of the front end."""
-        front = sequential.init(self.front, START, known)
-        if known is None:
-            return Both(front, core.init(self.core, START))
-        return Both(front, _followed(self.world, self.core))
+    def start(self, known: Learned | None, learning: Iterable[Frame]) -> Both:
+        """State before the first frame; the core has followed the frames of the learning run."""
+        made, begin = learner(self.world.setting.feeder), START - LEARN_S - 2.0 * LEARN_STEP_S
+        # A front end that learns nothing: fixed errors stay in its residuals.
+        front, state = sequential.init(made, begin, class_only(made)), core.init(self.core, begin)
+        for frame in learning:
+            front, _, _ = sequential.step(made, front, frame)
+            m, seen = core.residuals(front)
+            state, _ = core.step(self.core, state, frame.t, m, seen)
+        return Both(sequential.init(self.front, START, known), state)
 
     def step(self, state: Both, frame: Frame) -> tuple[Both, Answer]:
         """Process one frame."""
@@ -211,19 +215,17 @@ class Shadow:
         return Both(front, now, suspicion), Answer(v2, decision, named)
 
 
-@lru_cache(maxsize=16)
-def _followed(world: World, kernel: Core) -> CoreState:
-    """The core after the learning run."""
-    made = watcher(
-        world.setting.feeder, Model.MATCHED, step_s=LEARN_STEP_S, commission_s=2.0 * LEARN_S
-    ).design
+def learner(feeder: str) -> SequentialDesign:
+    """The default monitor with the tick of the learning run."""
+    made = watcher(feeder, Model.MATCHED, step_s=LEARN_STEP_S, commission_s=LEARN_S).design
+    assert isinstance(made, SequentialDesign)
+    return made
+
+
+def learning(setting: Setting) -> Iterator[Frame]:
+    """Honest frames of the six hours before `START`."""
     begin = START - LEARN_S - 2.0 * LEARN_STEP_S
-    front, state = sequential.init(made, begin), core.init(kernel, begin)
-    for frame, _ in play(world.setting, LEARN_S, step_s=LEARN_STEP_S, start=begin):
-        front, _, _ = sequential.step(made, front, frame)
-        m, seen = core.residuals(front)
-        state, _ = core.step(kernel, state, frame.t, m, seen)
-    return state
+    yield from (frame for frame, _ in play(setting, START - begin, step_s=LEARN_STEP_S, start=begin))
 
 
 # --- acceptance regions -------------------------------------------------------------------------

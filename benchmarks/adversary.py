@@ -56,6 +56,8 @@ from benchmarks._adversary import (
     core_region,
     falsified,
     faults,
+    learner,
+    learning,
     scales,
 )
 from benchmarks._arguments import count
@@ -67,23 +69,19 @@ from benchmarks._scenes import (
     beyond,
     learned,
     neighbours,
-    play,
-    watcher,
     without,
 )
 from feeders.model.site import Site, unread
 from feeders.registry import SEQUENTIAL
 from feeders.simulation.scenario import START
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Floats, Ints
 from gridsec.estimators import sequential
-from gridsec.estimators.sequential import SequentialDesign, SequentialState
-from gridsec.estimators.sequential.meter_bias import Learned
+from gridsec.estimators.sequential import SequentialState
 from gridsec.interface import Decision, Frame
 from gridsec.planning.detectability import acceptance_region, honest_covariance
 from gridsec.planning.unavoidable import (
     AcceptanceRegion,
     ConeProgram,
-    Faults,
     blind_norm,
     deviations,
     every_test,
@@ -143,7 +141,7 @@ def scattered(where: Site, first: int, seed: int) -> Ints:  # noqa: ARG001  # a 
 def lateral(where: Site, first: int, seed: int) -> Ints:
     """Two thirds of the meters of one lateral, the farthest ones."""
     most = where.meters.size // 3
-    sets = [one for one in beyond(where) if 3 <= one.size and 2 * one.size // 3 <= most]
+    sets = [one for one in beyond(where) if one.size >= 3 and 2 * one.size // 3 <= most]
     ours = [one for one in sets if first in one] or sets
     chosen = ours[0] if ours else third(where, first, seed)
     order = neighbours(where, first)
@@ -246,7 +244,8 @@ class Scene:
         self.site, self.made = self.world.site, self.world.monitor.design
         self.monitor = Shadow(self.world) if estimator == SHADOW else Registered(estimator, self.world)
         known = learned(self.world.setting) if kind.learned else None
-        front, self.before = sequential.init(self.made, START, known), self.monitor.start(known)
+        front = sequential.init(self.made, START, known)
+        self.before = self.monitor.start(known, learning(self.world.setting) if kind.learned else ())
         first = int(np.argmax(self.made.prior.variance[self.made.prior.meters]))
         self.meters = kind.place(self.site, first, seed)
         self.frames = [
@@ -363,18 +362,14 @@ class Scene:
         return falsified(frame, self.made, self.meters, amounts, powers=kind.powers, busbar=kind.busbar)
 
     def _learned(self, amounts: Callable[[int], Floats] | None) -> object:
-        """State of the monitor after six hours of learning under the attack; meters it names stay out."""
+        """State of the monitor after six hours of learning under the attack."""
         setting = self.world.setting
-        made: SequentialDesign = watcher(
-            setting.feeder, Model.MATCHED, step_s=LEARN_STEP_S, commission_s=LEARN_S
-        ).design
-        begin = START - LEARN_S - 2.0 * LEARN_STEP_S
-        state = sequential.init(made, begin)
-        for frame, _ in play(setting, START - begin, step_s=LEARN_STEP_S, start=begin):
-            seen = frame if amounts is None else self._false(frame, amounts(0))
-            state, _, _ = sequential.step(made, state, seen)
-        known: Learned = state.learned
-        return self.monitor.start(known)
+        frames = [frame if amounts is None else self._false(frame, amounts(0)) for frame in learning(setting)]
+        made = learner(setting.feeder)
+        state = sequential.init(made, START - LEARN_S - 2.0 * LEARN_STEP_S)
+        for frame in frames:
+            state, _, _ = sequential.step(made, state, frame)
+        return self.monitor.start(state.learned, frames)
 
 
 def _root(v2: Floats) -> Floats:

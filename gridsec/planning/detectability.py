@@ -27,7 +27,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.measurements import nominal_uncertainty
-from gridsec.estimators.sequential.meter_bias import Learned, Learning, class_only, learn, no_readings
+from gridsec.estimators.sequential.meter_bias import Learning, class_only, learn, no_readings
 from gridsec.estimators.sequential.posterior import condition
 from gridsec.estimators.sequential.search import Limits, false_power_charge, set_cost
 from gridsec.estimators.sequential.time_scales import Scales, chi_square_limit, empty, score_limit, scored

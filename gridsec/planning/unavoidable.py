@@ -231,7 +231,9 @@ class ConeProgram:
         self.faults = faults
         rows, forms = tests.rows @ faults.signature, [form @ faults.signature for form in tests.forms]
         # A form counts by its triangular factor: q rows in place of p.
-        forms = [np.asarray(np.linalg.qr(form, mode="r")) if len(form) > form.shape[1] else form for form in forms]
+        forms = [
+            np.asarray(np.linalg.qr(form, mode="r")) if len(form) > form.shape[1] else form for form in forms
+        ]
         largest = np.abs(rows).max(axis=0, initial=0.0)
         for form in forms:
             largest = np.maximum(largest, np.linalg.norm(form, axis=0))
