@@ -65,9 +65,9 @@ class Detectable:
     meters: pd.DataFrame
     # one row for each customer: `error`, the largest error of the sequential monitor's reconstruction under M
     # unnoticed manipulated meters; `error_fits`, the largest distance of two voltages that are consistent
-    # with the same readings; `error_undetected`, `error_found` and `error_unavoidable`: errors under attacks up
-    # to the limits less a fifth, beyond the limits by a fifth, and undetected by every test, once fixed errors
-    # are learned
+    # with the same readings; `error_undetected`, `error_found` and `error_unavoidable`: errors by attacks
+    # within the limits less a fifth, beyond the limits by a fifth, and undetected by every test, once fixed
+    # errors are learned
     customers: pd.DataFrame
     share: float = SHARE
 

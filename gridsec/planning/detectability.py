@@ -290,8 +290,8 @@ class Threshold:
 
     undetected: reached by `lies`; every statistic is at most ``1 - ROOM`` of its limit.
     found: every larger attack by as many meters has a statistic beyond ``1 + ROOM`` of its limit.
-    unavoidable: no test with the same rate of false alarms detects up to this size, by the meters of `lies`, at
-        least every second time. For an error of a reconstruction it is the error of that size.
+    unavoidable: an attack of this size by the meters of `lies` is missed at least every second time by every
+        test with the same rate of false alarms.
     """
 
     undetected: float

@@ -258,8 +258,8 @@ def inconsistent(
 ) -> bool:
     """True where the misfit of the trusted meters, or a score of a power, is beyond its limit.
 
-    model: (p,) largest model errors, squared pu. tail: probability of a false alarm. scores: of the customers'
-    powers; None to test the misfit alone, with all of the probability. O(p), O(p^2) close to a limit.
+    model: (p,) largest model errors, squared pu. tail: probability of a false alarm. scores: of the powers;
+    None to test the misfit alone, with all of the probability. O(p), O(p^2) close to a limit.
     """
     half = tail if scores is None else 0.5 * tail
     beyond = np.sqrt(max(loo.chi_square, 0.0)) - np.sqrt(chi_square_limit(now.count, half))
