@@ -225,7 +225,13 @@ COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
         "fits": "up to this, V, the readings are those of some honest feeder; ∞: no limit",
         "identified": "beyond this, V, every explanation by at most M meters accuses it; ∞: no size does",
         "error": "largest unnoticed error of the reconstructed voltage, V; ∞: no limit is proved",
+        "undetected": "an attack of this size, V, that no test of the monitor detects, once errors are learned",
+        "found": "beyond this, V, a test of the monitor detects it, once errors are learned",
+        "unavoidable": "up to this, V, every test misses it at least every second time",
         "error_fits": "largest distance of two voltages that fit the same readings, V; ∞: no limit",
+        "error_undetected": "error, V, by attacks that no test of the monitor detects, once errors are learned",
+        "error_found": "attacks with a larger error, V, are detected by the monitor, once errors are learned",
+        "error_unavoidable": "error, V, that every test leaves, by the meters of `error_undetected`",
     },
     "droop": {
         **_VOLTS,

@@ -24,7 +24,15 @@ from gridsec.errors import DesignInfeasible, Problem, raise_if_any
 from gridsec.estimators.sequential import SequentialOptions
 from gridsec.estimators.sequential import design as design_sequential
 from gridsec.planning.collusion import Corridor, furthest
-from gridsec.planning.detectability import Rule, named_size, rule, within
+from gridsec.planning.detectability import (
+    MonitorTests,
+    Rule,
+    Threshold,
+    learned_scales,
+    named_size,
+    rule,
+    within,
+)
 from gridsec.planning.stealthy_attacks import ErrorBox, largest_lie, worst_error
 
 __all__ = ["Detectable", "detectable", "monitor_rule", "workers"]
@@ -49,11 +57,17 @@ class Detectable:
     # `fits_alone`, `fits`: the largest attack that is consistent with an honest feeder, all errors within
     # their worst cases: no test without false alarms is sure to detect it; every larger one is inconsistent;
     # - `identified_alone`, `identified`: for every larger attack, all explanations by at most M meters accuse
-    # this meter
+    # this meter; - `undetected_alone`, `undetected`: once fixed errors are learned, the largest attack within
+    # the limits of all tests of the monitor, the misfit's included, with a fifth of each limit left to honest
+    # residuals; - `found_alone`, `found`: every larger attack exceeds a limit by more than a fifth of it; -
+    # `unavoidable_alone`, `unavoidable`: no test with the same rate of false alarms detects this size, by the
+    # meters of `undetected`, more often than every second time
     meters: pd.DataFrame
     # one row for each customer: `error`, the largest error of the sequential monitor's reconstruction under M
     # unnoticed manipulated meters; `error_fits`, the largest distance of two voltages that are consistent
-    # with the same readings
+    # with the same readings; `error_undetected`, `error_found` and `error_unavoidable`: errors by attacks
+    # within the limits less a fifth, beyond the limits by a fifth, and undetected by every test, once fixed
+    # errors are learned
     customers: pd.DataFrame
     share: float = SHARE
 
@@ -128,10 +142,13 @@ class _Given:
     corridors: Mapping[tuple[bool, int], Corridor]
     worst: ErrorBox
     claims: Floats
+    tests: MonitorTests
+    learned: Mapping[int, Corridor]
 
     @classmethod
     def of(cls, site: Site, max_attacked: int, share: float, risk: float) -> _Given:
         given = monitor_rule(site, risk=risk, share=share)
+        tests = MonitorTests.of(learned_scales(given.design, learned=True, model=given.model))
         return cls(
             site,
             max_attacked,
@@ -143,6 +160,8 @@ class _Given:
             },
             box(site, share=share, curves=CurvePositions.DEADBAND),
             _claims(site, given, share),
+            tests,
+            {count: tests.corridor(count) for count in (1, max_attacked)},
         )
 
 
@@ -173,7 +192,9 @@ def monitor_rule(site: Site, *, risk: float = RISK, share: float = SHARE) -> Rul
         plant(site),
         doubt=load_doubt(site),
         step_s=settings.tick_s,
-        options=SequentialOptions(alarms_per_year=settings.alarms_per_year),
+        options=SequentialOptions(
+            alarms_per_year=settings.alarms_per_year, commission_s=settings.commission_s
+        ),
     )
     p = -share * site.loads.load_peak
     q = 0.5 * (site.loads.tan_min + site.loads.tan_max) * p
@@ -218,6 +239,7 @@ def _meter(given: _Given, j: int) -> dict[str, Any]:
             "named": named,
             "fits": fits[count],
             "identified": fits[2 * count],
+            **_sizes(given.tests.threshold(given.learned[count], unit, must=j)),
         }
         row |= {f"{name}{suffix}": float(volts_of_lie(base, size)) for name, size in sizes.items()}
     return row
@@ -227,9 +249,18 @@ def _customer(given: _Given, i: int) -> dict[str, Any]:
     site, liars = given.site, given.max_attacked
     bus, base = int(site.feeder.bus[i]), site.customer_volt[i]
     moved = furthest(given.corridors[True, liars], given.rule.weights(bus)).bound
+    # At the busbar the monitor shows the reading of its meter.
+    own = float(bus >= site.feeder.busbar_places().stop)
+    learned = given.tests.threshold(given.learned[liars], own * given.tests.region.weights[bus])
     return {
         "customer": site.feeder.customers[i],
         "bus": site.feeder.buses[bus],
         "error": float(volts_of_lie(base, moved + given.rule.spread(bus))),
         "error_fits": float(volts_of_lie(base, worst_error(given.worst, i, liars).bound)),
+        **{f"error_{name}": float(volts_of_lie(base, size)) for name, size in _sizes(learned).items()},
     }
+
+
+def _sizes(threshold: Threshold) -> dict[str, float]:
+    """Sizes of a threshold by column, squared pu."""
+    return {name: getattr(threshold, name) for name in ("undetected", "found", "unavoidable")}

@@ -19,16 +19,35 @@ Source: D. Hsu, S. Kakade, T. Zhang, "A tail inequality for quadratic forms of s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.sequential.design import SequentialDesign
+from gridsec.estimators.sequential.measurements import nominal_uncertainty
+from gridsec.estimators.sequential.meter_bias import Learning, class_only, learn, no_readings
+from gridsec.estimators.sequential.posterior import condition
 from gridsec.estimators.sequential.search import Limits, false_power_charge, set_cost
+from gridsec.estimators.sequential.time_scales import Scales, chi_square_limit, empty, score_limit, scored
 from gridsec.planning.collusion import Corridor, Shift, corridor, furthest
+from gridsec.planning.unavoidable import AcceptanceRegion, ConeProgram, Faults, deviations
 
-__all__ = ["Rule", "Shift", "largest_shift", "named_size", "rule", "within"]
+__all__ = [
+    "ROOM",
+    "MonitorTests",
+    "Rule",
+    "Shift",
+    "Threshold",
+    "acceptance_region",
+    "honest_covariance",
+    "largest_shift",
+    "learned_scales",
+    "named_size",
+    "rule",
+    "within",
+]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,3 +194,163 @@ def _worst(own: float, gain: Floats, cost: Floats, budget: float) -> float:
         best = max(best, (total + slope * u) * (budget - spent - u))
         total, spent = total + gain[k], spent + cost[k]
     return best
+
+
+# --- All tests of the monitor together ---
+
+
+def learned_scales(design: SequentialDesign, *, learned: bool, model: Floats) -> Scales:
+    """Scales of the monitor with all meters trusted and powers as the design expects them.
+
+    design: the monitor.
+    learned: fixed errors are known as well as after `commission_s` without a pause; else by their class.
+    model (p,): error of the model, squared pu.
+    """
+    known, duration_s = class_only(design), design.options.commission_s
+    if learned and duration_s > 0.0:
+        every = np.ones(model.size, dtype=np.bool_)
+        known = learn(design, known, _gathered(design, every, duration_s), every, duration_s).learned
+    window = empty(design.lengths, model.size)
+    return Scales(design, nominal_uncertainty(design), window, known, model)
+
+
+def _gathered(design: SequentialDesign, every: Bools, duration_s: float) -> Learning:
+    """Sums of a commissioning of residuals zero: variances do not depend on the residuals."""
+    count = np.full(every.size, max(1, round(duration_s / design.step_s)))
+    return replace(no_readings(every, 0.0), count=count, time_s=np.full(every.size, duration_s))
+
+
+def acceptance_region(
+    scales: Scales, *, misfit: bool = True, busbar: bool = True, levels: Sequence[float] | None = None
+) -> AcceptanceRegion:
+    """Displacements of all residuals that no test of the monitor rejects, all meters trusted.
+
+    The limit of the misfit is that of ``sqrt(m' Q m)``: with the honest part of m it is at most the sum of
+    both roots.
+
+    scales: the scales at one moment.
+    misfit, busbar: use the tests of the misfit and of the busbar's meter.
+    levels (s,): largest mean of the displacement on each scale, as a part of its largest value; None for a
+        constant displacement. A scale of level 0 does not test.
+    """
+    design, model = scales.design, scales.model
+    every = np.ones(model.size, dtype=np.bool_)
+    rows, forms = [], []
+    for s, level in enumerate([1.0] * len(design.lengths) if levels is None else levels):
+        if level <= 0.0:
+            continue
+        here = scales[s]
+        now = condition(here.prior, here.noise, every)
+        Q, std = now.Q, np.sqrt(1.0 / now.diagonal())
+        rows.append(level * Q * (std**2 / here.limits.limit(std))[:, None])
+        if misfit:
+            error, tail = np.sqrt(model @ np.abs(Q) @ model), design.tails[s]
+            if scored(design):
+                tail = 0.5 * tail
+                rows.append(level * _scores(design, Q) / (score_limit(design.customers, tail) + error))
+            root = np.sqrt(chi_square_limit(model.size, tail)) + error
+            forms.append(level * np.linalg.cholesky(Q).T / root)
+        if busbar:
+            incidence = design.busbar_incidence
+            together = incidence.T @ Q
+            form = np.sqrt(np.einsum("bp,pb->b", together, incidence))
+            some = form > 0.0
+            rows.append(level * together[some] / (design.sigmas[s] * form[some])[:, None])
+    last = scales[len(design.lengths) - 1]
+    gain = condition(last.prior, last.noise, every)
+    return AcceptanceRegion(np.vstack(rows), tuple(forms), last.prior.covariance @ gain.Q)
+
+
+def _scores(design: SequentialDesign, Q: Floats) -> Floats:
+    """Scores of the customers' active powers per displacement, standard deviations, (k, p)."""
+    columns = design.faults.columns(np.arange(design.customers))[design.prior.meters]
+    information = np.einsum("pk,pk->k", columns, Q @ columns)
+    some = information > np.finfo(np.float64).tiny
+    return np.asarray((columns[:, some].T @ Q) / np.sqrt(information[some])[:, None])
+
+
+def honest_covariance(scales: Scales, ticks: int) -> tuple[Floats, Floats]:
+    """Covariance of a mean of honest residuals, (p, p), and that of the places' voltages with it, (n, p).
+
+    scales: the scales at one moment.
+    ticks: length of the mean, with all readings.
+    """
+    design, prior = scales.design, scales[len(scales.design.lengths) - 1].prior
+    V = prior.between + np.diag(scales.learned.variance + design.white / ticks)
+    return V, prior.covariance
+
+
+ROOM = 0.2
+"""Part of every limit for honest residuals: 1.2 standard deviations of a Gaussian one; measured, 0.15."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Threshold:
+    """Size of an attack at which the monitor stops being CLEAN. All sizes squared pu.
+
+    undetected: reached by `lies`; every statistic is at most ``1 - ROOM`` of its limit.
+    found: every larger attack by as many meters has a statistic beyond ``1 + ROOM`` of its limit.
+    unavoidable: an attack of this size by the meters of `lies` is missed at least every second time by every
+        test with the same rate of false alarms.
+    """
+
+    undetected: float
+    found: float
+    unavoidable: float
+    lies: Floats  # (p,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MonitorTests:
+    """All tests of the monitor at one moment. n places, p meters."""
+
+    region: AcceptanceRegion
+    reach: Floats  # (p,) largest attack on each meter in any collusion, squared pu
+    covariance: Floats  # (p, p) V of honest residuals over the longest scale
+    prior: Floats  # (n, p) covariance of the places' voltages with the residuals
+    z: float  # standard deviations of one test of the longest scale, with the monitor's rate of false alarms
+
+    @staticmethod
+    def of(scales: Scales) -> MonitorTests:
+        """Tests of a moment, with all meters trusted."""
+        design = scales.design
+        region = acceptance_region(scales)
+        p, last = scales.model.size, design.lengths[-1]
+        covariance, prior = honest_covariance(scales, last)
+        # |a| <= |R_s^-1| |R_s a| on each scale, and a' Q a <= 1 bounds a_j by the root of (Q^-1)_jj.
+        step = len(region.rows) // len(design.lengths)
+        blocks = [region.rows[k * step : k * step + p] for k in range(len(design.lengths))]
+        linear = [np.abs(np.linalg.inv(block)).sum(axis=1) for block in blocks]
+        norms = [np.linalg.norm(np.linalg.inv(form), axis=1) for form in region.forms]
+        z = deviations(design.options.alarms_per_year, last * design.step_s)
+        return MonitorTests(region, np.min([*linear, *norms], axis=0), covariance, prior, z)
+
+    def corridor(self, liars: int) -> Corridor:
+        """Linear tests for at most M manipulated meters, for `threshold`."""
+        return corridor(self.region.rows, liars, reach=self.reach)
+
+    def threshold(self, within_: Corridor, along: Floats, *, must: int | None = None) -> Threshold:
+        """Threshold of attacks along a direction.
+
+        within_: of `corridor`.
+        along (p,): a unit vector for the attack on one meter, or the weights of a reconstruction.
+        must: a meter that is manipulated in any case.
+        """
+        linear = furthest(within_, along, must=must)
+        meters = np.flatnonzero(linear.lies)
+        if not meters.size:
+            return Threshold(0.0, (1.0 + ROOM) * linear.bound, 0.0, np.zeros(along.size))
+        faults = Faults.voltages(meters, self.prior.shape, np.inf)
+        # Finite ranges: no lie is beyond the reach.
+        faults = replace(faults, least=-self.reach[meters], most=self.reach[meters])
+        hidden = ConeProgram(self.region, faults)(along[meters], 1.0 - ROOM)
+        lies = np.zeros(along.size)
+        lies[meters] = hidden.amounts
+        least = _largest_effect(self.covariance, faults, along[meters], self.z)
+        return Threshold(hidden.size, (1.0 + ROOM) * linear.bound, least, lies)
+
+
+def _largest_effect(covariance: Floats, faults: Faults, along: Floats, z: float) -> float:
+    """``z sqrt(g F^-1 g')`` of `gridsec.planning.unavoidable` for one effect g (q,)."""
+    F = faults.signature.T @ np.linalg.solve(covariance, faults.signature)
+    return z * float(np.sqrt(along @ np.linalg.solve(F, along)))

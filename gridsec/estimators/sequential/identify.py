@@ -51,6 +51,7 @@ from gridsec.estimators.sequential.time_scales import (
     ScaleTest,
     Window,
     inconsistent,
+    load_scores,
     scale_test,
     update_posterior,
 )
@@ -136,18 +137,23 @@ class _Tick:
             best = self.candidates[s].best
             now, test = best.posterior, scale_test(design, here, best.loo)
             busbar_weights(design, now)
-            left = design.decoder is None and inconsistent(now, test.loo, self.model, design.tails[s])
+            left = design.decoder is None and self._inconsistent(s, now, test)
             self.inconsistent[s] = left
         if not self.clear:
             self.trust.record(s, test.enough, test.above_limit, test.above_release_limit)
         return now, test
+
+    def _inconsistent(self, s: int, now: Posterior, test: ScaleTest) -> bool:
+        """Trusted meters are inconsistent together."""
+        scores = load_scores(self.design, now, self.full_posteriors[s], test.loo)
+        return inconsistent(now, test.loo, self.model, self.design.tails[s], scores)
 
     def _search(self, s: int, now: Posterior, test: ScaleTest) -> None:
         """Search a scale with a failed test, or one that is due again."""
         design, here, tick = self.design, self.scales[s], self.state.ticks
         due = _search_due(design, self.trust, test, s, tick, searched=bool(self.candidates))
         single = due or any_of(test.above_limit & self.trust.trusted)
-        left = inconsistent(now, test.loo, self.model, design.tails[s])
+        left = self._inconsistent(s, now, test)
         # A misfit that no search explains is searched again from time to time only.
         again = left and (not self.inconsistent[s] or tick % _SEARCH_INTERVAL == 0)
         over = single or (again and not _aligned_misfit(design, here, now, test, self.honest))

@@ -7,7 +7,10 @@ meter j adds at most ``sup ||e||_Q <= sqrt(e^T |Q| e)`` to its root, so that its
 
     (sqrt(q) + sqrt(e^T |Q| e))^2
 
-with q the quantile of chi-square at the false-alarm rate.
+with q the quantile of chi-square at half of the false-alarm rate. The other half is for the scores of the
+customers' active powers: ``R_k^T Q m`` has the variance ``i_k = R_k^T Q R_k`` for honest meters, R_k being
+the effect of one power. A manipulation that looks like loads raises them far before the misfit. The same
+error of the model adds at most ``sqrt(i_k e^T |Q| e)`` to a score.
 
 References
 ----------
@@ -21,7 +24,7 @@ from functools import cached_property, lru_cache
 from math import ceil
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtri, ndtri
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices
 from gridsec.estimators.sequential.design import SequentialDesign
@@ -247,19 +250,69 @@ def update_posterior(
     return now
 
 
-# --- Chi-square test ---
+# --- Tests of all trusted meters together ---
 
 
-def inconsistent(now: Posterior, loo: LeaveOneOut, model: Floats, tail: float) -> bool:
-    """True where the chi-square of the trusted meters is beyond its limit; O(p), O(p^2) close to the limit.
+def inconsistent(
+    now: Posterior, loo: LeaveOneOut, model: Floats, tail: float, scores: LoadScores | None = None
+) -> bool:
+    """True where the misfit of the trusted meters, or a score of a power, is beyond its limit.
 
-    model: (p,) largest model errors, squared pu. tail: probability of a false alarm.
+    model: (p,) largest model errors, squared pu. tail: probability of a false alarm. scores: of the powers;
+    None to test the misfit alone, with all of the probability. O(p), O(p^2) close to a limit.
     """
-    root, chance = np.sqrt(max(loo.chi_square, 0.0)), np.sqrt(chi_square_limit(now.count, tail))
-    if root <= chance:
+    half = tail if scores is None else 0.5 * tail
+    beyond = np.sqrt(max(loo.chi_square, 0.0)) - np.sqrt(chi_square_limit(now.count, half))
+    if scores is not None:
+        beyond = max(beyond, scores.largest - score_limit(scores.count, half))
+    if beyond <= 0.0:
         return False
     at, Q = now.precision()
-    return bool(root > chance + np.sqrt(model[at] @ np.abs(Q) @ model[at]))
+    return bool(beyond > np.sqrt(model[at] @ np.abs(Q) @ model[at]))
+
+
+@dataclass(frozen=True, slots=True)
+class LoadScores:
+    """Scores of the customers' active powers, in standard deviations."""
+
+    largest: float  # the largest one
+    count: int  # number of customers
+
+
+MAX_SCORED = 724
+"""Largest number of meters and of customers with scores: their information is O(p^2 N)."""
+
+
+def scored(design: SequentialDesign) -> bool:
+    """True if the scores of the customers' powers are tests of the design."""
+    return max(design.customers, design.fixed.size) <= MAX_SCORED
+
+
+def load_scores(
+    design: SequentialDesign, now: Posterior, kept: Posterior | None, loo: LeaveOneOut
+) -> LoadScores | None:
+    """Scores of the residuals of a posterior; None on large feeders.
+
+    kept: posterior of all meters with the same prior, if any. Its information is computed once, and is at
+    least that of fewer meters.
+    """
+    customers = design.customers
+    if not scored(design):
+        return None
+    full = now if kept is None or kept.prior is not now.prior else kept
+    if full.load_information is None:
+        columns = design.faults.columns(np.arange(customers))[design.prior.meters]
+        full.load_information = np.einsum("pk,pk->k", columns, full.Q @ columns)
+    score = design.faults.weighted(loo.weights)[:customers]
+    # A customer at the busbar moves no voltage.
+    information = np.maximum(full.load_information, np.finfo(np.float64).tiny)
+    return LoadScores(float(np.max(np.abs(score) / np.sqrt(information), initial=0.0)), customers)
+
+
+@lru_cache(maxsize=4096)
+def score_limit(count: int, tail: float) -> float:
+    """Two-sided quantile of the largest of `count` Gaussian scores at the tail, by the union bound."""
+    return -float(ndtri(0.5 * tail / count)) if count else np.inf
 
 
 @lru_cache(maxsize=4096)

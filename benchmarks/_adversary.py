@@ -1,0 +1,318 @@
+"""Worlds, monitors and acceptance regions of `benchmarks.adversary`.
+
+The acceptance region of the default monitor is `gridsec.planning.detectability.acceptance_region`. That of
+the statistical core for a step of age n is, with the exact information I of all modes at that onset,
+
+    members:  |(U I U' a)_j| <= y_j,  y_j: log Lambda(y_j, F_jj) = log gamma - log(weight capital / p)
+    omnibus:  a' U I M I U' a <= 2 (log gamma - log(weight capital)) + log det,
+
+M being the quadratic form of `gridsec.estimators.modal.detector.omnibus`. Other estimators of the registry
+are played with the attacks made for the default monitor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from math import log
+from typing import Any
+
+import numpy as np
+
+from benchmarks._scenes import LEARN_S, LEARN_STEP_S, Model, Setting, play, site, watcher
+from feeders.model.site import Site, Snapshot, from_tables, late
+from feeders.registry import SEQUENTIAL, DesignedEstimator, design
+from feeders.simulation.scenario import START
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.estimators import sequential
+from gridsec.estimators.modal import core, detector, estimate, signatures
+from gridsec.estimators.modal.core import Core, CoreState, Suspicion
+from gridsec.estimators.sequential import SequentialDesign, SequentialState
+from gridsec.estimators.sequential.meter_bias import Learned, class_only
+from gridsec.estimators.sequential.time_scales import Scales
+from gridsec.grid.network import Power
+from gridsec.interface import Decision, Frame
+from gridsec.planning.unavoidable import AcceptanceRegion, Faults
+
+SHADOW = "modal-shadow"
+"""The statistical core behind the default monitor's front end, not an estimator of the registry."""
+LATE_S = 60.0
+"""Age of late powers, s."""
+LARGEST = 0.2
+"""Largest false voltage, squared pu: beyond about 10 % of the voltage no reading is plausible."""
+
+
+# --- worlds -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """One honest world.
+
+    Attributes
+    ----------
+    setting
+        Feeder, seed, and whether fixed errors are learned; all powers are read.
+    aged
+        Powers are `LATE_S` old, and the feeder's files state it.
+    """
+
+    setting: Setting
+    aged: bool = False
+
+    @property
+    def site(self) -> Site:
+        """The feeder as its files state it."""
+        return _aged(self.setting.feeder) if self.aged else site(self.setting.feeder)
+
+    @property
+    def monitor(self) -> DesignedEstimator:
+        """The default monitor, without commissioning of its own."""
+        return (
+            _aged_watcher(self.setting.feeder) if self.aged else watcher(self.setting.feeder, Model.MATCHED)
+        )
+
+    def frames(self, duration_s: float) -> Iterator[tuple[Frame, Floats]]:
+        """Honest frames and true squared voltages, (N,), from `START` on."""
+        if not self.aged:
+            yield from ((frame, truth.v2) for frame, truth in play(self.setting, duration_s))
+            return
+        past: list[Frame] = []
+        begin = START - LATE_S
+        for frame, truth in play(self.setting, duration_s + LATE_S, start=begin):
+            past.append(frame)
+            if frame.t >= START:
+                yield _with_late_powers(self.site, frame, past.pop(0)), truth.v2
+
+
+@lru_cache(maxsize=8)
+def _aged(feeder: str) -> Site:
+    tables = site(feeder).tables
+    meters = replace(tables.meta.meters, p_interval_s=LATE_S)
+    return from_tables(replace(tables, meta=replace(tables.meta, meters=meters)))
+
+
+@lru_cache(maxsize=8)
+def _aged_watcher(feeder: str) -> DesignedEstimator:
+    tables = _aged(feeder).tables
+    settings = replace(tables.meta.monitor, estimator=SEQUENTIAL, commission_s=0.0, tick_s=1.0)
+    return design(from_tables(replace(tables, meta=replace(tables.meta, monitor=settings))))
+
+
+def _with_late_powers(where: Site, frame: Frame, old: Frame) -> Frame:
+    """Frame with the powers of an older one, widened as the files state."""
+    names = ("p", "p_error", "q", "q_error")
+    frame = replace(frame, **{name: getattr(old, name) for name in names})
+    p_kw = -old.p[where.meters] * where.feeder.base_kva
+    told = Snapshot(frame.t, np.zeros(p_kw.size), p_kw, np.full(p_kw.size, np.nan), 0.0)
+    aged = late(where, told)
+    return frame if aged is None else aged.widen(where, frame)
+
+
+# --- monitors -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """Answer of a monitor to one frame. N customers, p meters."""
+
+    v2: Floats  # (N,) squared voltages, pu
+    decision: Decision
+    named: Bools  # (p,)
+
+
+class Registered:
+    """An estimator of the registry.
+
+    Parameters
+    ----------
+    name
+        Its name; the default monitor starts with the learned errors, others learn by themselves.
+    world
+        The world.
+    """
+
+    def __init__(self, name: str, world: World) -> None:
+        self.design = world.monitor if name == SEQUENTIAL else _other(name, world)
+        self.default = name == SEQUENTIAL
+
+    def start(self, known: Learned | None, learning: Iterable[Frame]) -> Any:  # noqa: ARG002  # as `Shadow`
+        """State before the first frame, with what the default monitor learned."""
+        if self.default:
+            return sequential.init(self.design.design, START, known)
+        return self.design.init(START)
+
+    def step(self, state: Any, frame: Frame) -> tuple[Any, Answer]:
+        """Process one frame."""
+        state, estimate_, verdict = self.design.step(state, frame)
+        return state, Answer(estimate_.v2, verdict.decision, verdict.suspects)
+
+
+def _other(name: str, world: World) -> DesignedEstimator:
+    tables = world.site.tables
+    settings = replace(tables.meta.monitor, estimator=name, commission_s=0.0)
+    return design(from_tables(replace(tables, meta=replace(tables.meta, monitor=settings))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Both:
+    """Front end and core."""
+
+    front: SequentialState
+    core: CoreState
+    suspicion: Suspicion | None = None
+
+
+class Shadow:
+    """The core behind the default monitor's front end; every customer has a meter.
+
+    ATTACKED: a meter is masked. UNDECIDED: log M is beyond its limit. Else CLEAN.
+
+    Parameters
+    ----------
+    world
+        The world.
+    """
+
+    LOOK = 4
+    """Ticks from one search to the next while log M is beyond its limit: a search takes long."""
+
+    def __init__(self, world: World) -> None:
+        self.front: SequentialDesign = world.monitor.design
+        tables = world.site.tables
+        kw = np.array([max(row.load_kw, row.pv_kw) for row in tables.customers])
+        self.core: Core = core.design(self.front, kw / world.site.feeder.base_kva)
+        self.world = world
+
+    def start(self, known: Learned | None, learning: Iterable[Frame]) -> Both:
+        """State before the first frame; the core has followed the frames of the learning run."""
+        made, begin = learner(self.world.setting.feeder), START - LEARN_S - 2.0 * LEARN_STEP_S
+        # A front end that learns nothing: fixed errors stay in its residuals.
+        front, state = sequential.init(made, begin, class_only(made)), core.init(self.core, begin)
+        for frame in learning:
+            front, _, _ = sequential.step(made, front, frame)
+            m, seen = core.residuals(front)
+            state, _ = core.step(self.core, state, frame.t, m, seen)
+        return Both(sequential.init(self.front, START, known), state)
+
+    def step(self, state: Both, frame: Frame) -> tuple[Both, Answer]:
+        """Process one frame."""
+        front, _, _ = sequential.step(self.front, state.front, frame)
+        m, seen = core.residuals(front)
+        now, evidence = core.step(self.core, state.core, frame.t, m, seen)
+        alarm, suspicion = core.alarmed(self.core, evidence), None
+        if alarm and front.ticks % self.LOOK == 0:
+            suspicion = core.identify(self.core, now, evidence)
+            if suspicion.found.named.any():
+                now, evidence = core.mask(self.core, now, suspicion)
+                alarm, suspicion = core.alarmed(self.core, evidence), None
+        shift = core.estimate(self.core, now, suspicion).mean[self.front.prior.meters]
+        named = now.masked.meters
+        decision = Decision.ATTACKED if named.any() else Decision.UNDECIDED if alarm else Decision.CLEAN
+        v2 = np.empty(m.size)
+        v2[self.front.plant.meters] = frame.y - m + shift
+        return Both(front, now, suspicion), Answer(v2, decision, named)
+
+
+def learner(feeder: str) -> SequentialDesign:
+    """The default monitor with the tick of the learning run."""
+    made = watcher(feeder, Model.MATCHED, step_s=LEARN_STEP_S, commission_s=LEARN_S).design
+    assert isinstance(made, SequentialDesign)
+    return made
+
+
+def learning(setting: Setting) -> Iterator[Frame]:
+    """Honest frames of the six hours before `START`."""
+    begin = START - LEARN_S - 2.0 * LEARN_STEP_S
+    yield from (frame for frame, _ in play(setting, START - begin, step_s=LEARN_STEP_S, start=begin))
+
+
+# --- acceptance regions -------------------------------------------------------------------------
+
+
+def scales(made: SequentialDesign, state: SequentialState) -> Scales:
+    """Scales of the default monitor at one moment."""
+    return Scales(made, state.uncertainty, state.window, state.learned, state.model_error)
+
+
+def core_region(kernel: Core, state: CoreState, age: int) -> AcceptanceRegion:
+    """Steps of a given age that the core accepts, all readings complete.
+
+    Parameters
+    ----------
+    kernel, state
+        The core, and its state after honest ticks.
+    age
+        Ticks since the onset, its own included.
+    """
+    modes, test = kernel.modes, state.detector
+    rows = np.flatnonzero(test.onsets.used & ~test.onsets.ramp)
+    row = int(rows[np.argmin(np.abs(test.onsets.age[rows] - age))])
+    joint, capital = signatures.joint(modes, test.onsets, state.static, row), test.capital[:, row]
+    left = kernel.limit - np.log(np.array(detector.WEIGHTS)) - capital
+    scored = joint.information @ modes.U.T
+    members = modes.U @ scored
+    s2, F = detector.SIZE**2, members.diagonal()
+    spread = 1.0 + s2 * F
+    y = np.sqrt(2.0 * spread / s2 * (left[0] + log(modes.size) + 0.5 * np.log(spread)))
+    now = signatures.scores(modes, test.onsets, state.static, np.array([row]))
+    size = s2 / modes.white
+    more = 1.0 + size * now.information[0]
+    M, offset = np.diag(size / more), float(np.log(more).sum())
+    if now.cov.size:
+        pull = now.side[0] * (size / more)
+        rest = np.eye(len(now.cov)) - now.cov @ (pull @ now.side[0].T)
+        M += pull.T @ np.linalg.solve(rest, now.cov) @ pull
+        offset += float(np.linalg.slogdet(rest)[1])
+    half = np.linalg.cholesky(M).T @ scored / np.sqrt(2.0 * left[1] + offset)
+    zero = np.zeros((len(kernel.effect), modes.size))
+    T = estimate.moves(modes, kernel.estimator, state.filter, joint, modes.U.T, zero)
+    return AcceptanceRegion(members / y[:, None], (half,), T)
+
+
+# --- faults -------------------------------------------------------------------------------------
+
+
+def faults(
+    where: Site, made: SequentialDesign, frame: Frame, meters: Ints, *, powers: bool, busbar: bool
+) -> Faults:
+    """Faults of a coalition at one frame.
+
+    Parameters
+    ----------
+    where, made, frame
+        The feeder, the default monitor, and the last honest frame.
+    meters
+        Meters with false voltages.
+    powers
+        Their customers' active powers may be false, within the declared range.
+    busbar
+        The busbar's meter may be false.
+    """
+    places, at = made.prior.variance.size, made.prior.meters
+    found = Faults.voltages(meters, (places, at.size), LARGEST)
+    if powers:
+        customers = made.plant.meters[meters]
+        columns = made.sensitivities.columns(Power.ACTIVE, customers)
+        p = frame.p[customers]
+        least, most = -where.loads.load_peak[customers] - p, where.loads.pv_peak[customers] - p
+        found = found.joined(Faults(-columns[at], columns, np.minimum(least, 0.0), np.maximum(most, 0.0)))
+    if busbar:
+        ones = np.ones((places, 1))
+        found = found.joined(Faults(-ones[at], ones, np.array([-LARGEST]), np.array([LARGEST])))
+    return found
+
+
+def falsified(
+    frame: Frame, made: SequentialDesign, meters: Ints, amounts: Floats, *, powers: bool, busbar: bool
+) -> Frame:
+    """Frame with the faults of `faults`, in these amounts, (q,)."""
+    y, p, v0 = frame.y.copy(), frame.p, frame.v0_squared
+    y[meters] = np.maximum(y[meters] + amounts[: meters.size], 0.0)
+    if powers:
+        p = p.copy()
+        p[made.plant.meters[meters]] += amounts[meters.size : 2 * meters.size]
+    if busbar:
+        v0 = v0 + float(amounts[-1])
+    return replace(frame, y=y, p=p, v0_squared=v0)
