@@ -194,8 +194,13 @@ def init(core: Core, t: float) -> CoreState:
     return CoreState(*parts, None, History((*parts, ())), (), masking.none(made))
 
 
-def step(
-    core: Core, state: CoreState, t: float, m: Floats, seen: Bools | None = None
+def step(  # noqa: PLR0917  # the state, and one tick
+    core: Core,
+    state: CoreState,
+    t: float,
+    m: Floats,
+    seen: Bools | None = None,
+    unknown: Floats | None = None,
 ) -> tuple[CoreState, Evidence]:
     """Take in the residuals of one tick.
 
@@ -209,6 +214,9 @@ def step(
         Residuals, squared pu; any finite value where not seen.
     seen : (p,)
         Meters with a reading; None: all.
+    unknown : (p, k)
+        Directions of the residuals that are unknown at this tick, times their standard deviations; None for
+        none. The tick says nothing about them where the standard deviations are large.
 
     Raises
     ------
@@ -219,7 +227,9 @@ def step(
     if masked.meters.any():
         seen = ~masked.meters if read is None else read & ~masked.meters
     pinned = np.flatnonzero(state.detector.pinned).tolist()
-    after, known, update = full.step(made, state.filter, state.static, t, m, seen, stay=bool(pinned))
+    after, known, update = full.step(
+        made, state.filter, state.static, t, m, seen, stay=bool(pinned), unknown=unknown
+    )
     test, evidence = detector.step(
         made, core.faults, state.detector, update, known, h=h, alert=CALM * core.limit
     )
@@ -233,12 +243,12 @@ def step(
     if evidence.log_m >= core.limit and (not pinned or (suspected and _elsewhere(evidence, pinned))):
         test = detector.pin(test, evidence.rows)
         if update.exact is not None:
-            last = replay.record(state.history, (after, known, test, ()), m, seen)
+            last = replay.record(state.history, (after, known, test, ()), m, seen, unknown)
             rows = np.flatnonzero(test.pinned).tolist()
             suspected = replay.replayed(made, last, test.onsets, rows)
     elif pinned and evidence.log_m < CALM * core.limit:
         test, suspected = detector.pin(test, evidence.rows[:0]), ()
-    history = replay.record(state.history, (after, known, test, suspected), m, seen)
+    history = replay.record(state.history, (after, known, test, suspected), m, seen, unknown)
     return CoreState(after, known, test, update, history, suspected, masked), evidence
 
 
@@ -267,9 +277,9 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
     parts = before, known, test
     now = CoreState(*parts, None, History((*parts, ())), (), masking.none(core.modes))
     evidence = Evidence(-inf, np.full(test.capital.shape, -inf))
-    for k, (t, m, seen) in enumerate(history.readings):
+    for k, (t, m, seen, unknown) in enumerate(history.readings):
         read = seen if k < first else ~named if seen is None else seen & ~named
-        now, evidence = step(core, now, t, m, read)
+        now, evidence = step(core, now, t, m, read, unknown)
     return replace(now, masked=masking.added(state.masked, named)), evidence
 
 
