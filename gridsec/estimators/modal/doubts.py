@@ -1,8 +1,8 @@
 """Directions of the residuals that one frame leaves unknown: unread powers, late ones, the busbar, clocks.
 
-The model of the residuals is fixed by the feeder's files. A frame may know less: a power without a reading, an
-interval far wider than the files state, an inverter that has not settled, a missing busbar voltage, a clock
-offset. Each such error d moves the residuals along one known column a, with unknown time dependence:
+The model of the residuals is fixed by the feeder's files. A frame may know less: a power without a reading,
+an interval far wider than the files state, an inverter that has not settled, a missing busbar voltage, a
+clock offset. Each such error d moves the residuals along one known column a, with unknown time dependence:
 
     m_t = w_t + b_t + e_t + f_t + A_t d_t
 
@@ -11,8 +11,8 @@ along A_t. For one column, with ``q = a' V^-1 a``, a lasting error d leaves
 
     a' (V + s^2 a a')^-1 a d = q d / (1 + s^2 q)  <=  d / s^2
 
-per tick in the score, in place of ``q d``: nothing accumulates, whatever the correlation in time. The price is
-evidence against a fault along a. It is unavoidable where the error may last.
+per tick in the score, in place of ``q d``: nothing accumulates, whatever the correlation in time. The price
+is evidence against a fault along a. It is unavoidable where the error may last.
 
 The estimate uses the standard deviations themselves: d is estimated from the residuals of the same tick,
 
@@ -88,16 +88,10 @@ def unknown(
     skew
         Changes of the voltages within clock offsets.
     """
-    frame, doubt, N = usual(measured.frame), design.doubt, design.customers
-    power = np.zeros(2 * N)
-    for std, known, error, factor in (
-        (power[:N], doubt.p, frame.p_error, uncertainty.p[0]),
-        (power[N:], doubt.q, frame.q_error, uncertainty.q[0]),
-    ):
-        # The part of the present error that the model does not contain.
-        wider = np.maximum(error * error / 3.0 - np.maximum(known, EXACT) ** 2, 0.0)
-        std += np.where(factor > 1.0, np.sqrt(wider), 0.0)
-    power[N:] = np.hypot(power[N:], _unsettled(design, predicted, measured.uses_q))
+    frame, doubt = usual(measured.frame), design.doubt
+    p = _wider(frame.p_error, doubt.p, uncertainty.p[0])
+    q = _wider(frame.q_error, doubt.q, uncertainty.q[0])
+    power = np.concatenate([p, np.hypot(q, _unsettled(design, predicted, measured.uses_q))])
     which = indices(power > 0.0)
     columns = [design.sensitivities.numbered(which) * power[which]] if which.size else []
     metered = np.atleast_1d(np.asarray(measured.busbar_metered))
@@ -114,6 +108,12 @@ def unknown(
         whole = np.hstack([whole, np.zeros((places, clocks.shape[1]))])
         meters = np.hstack([meters, clocks])
     return Unknown(whole, meters, measured.available & ~uncertainty.vouched[0])
+
+
+def _wider(error: Floats, known: Floats, factor: Floats) -> Floats:
+    """Standard deviations of the parts of powers' errors that the design does not contain, (N,), pu."""
+    more = np.maximum(error * error / 3.0 - np.maximum(known, EXACT) ** 2, 0.0)
+    return np.where(factor > 1.0, np.sqrt(more), 0.0)
 
 
 def _unsettled(design: SequentialDesign, predicted: Prediction, metered: Bools) -> Floats:

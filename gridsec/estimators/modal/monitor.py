@@ -13,9 +13,9 @@ A step, by module:
     verdict                         evidence of each meter, decision, explanations
 
 The residual of a meter is its squared reading less the model; fixed errors are states of the filter. A meter
-is named when `CONFIRM` searches in turn name it, or when it repeats its readings beyond chance. Named meters are
-masked from the onset of the manipulation on, and released by their readings (`masking`). The busbar's meter is
-named likewise; its phase then counts as not metered, until the meters agree with its reading again.
+is named when `CONFIRM` searches in turn name it, or when it repeats its readings beyond chance. Named meters
+are masked from the onset of the manipulation on, and released by their readings (`masking`). The busbar's
+meter is named likewise; its phase then counts as not metered, until the meters agree with its reading again.
 """
 
 from __future__ import annotations
@@ -26,18 +26,26 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, changed
-from gridsec.estimators.modal import core, doubts, full, masking, record, verdict
+from gridsec.estimators.modal import core, detector, doubts, full, masking, record, verdict
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.doubts import Unknown
 from gridsec.estimators.modal.record import Record
+from gridsec.estimators.modal.replay import History
 from gridsec.estimators.plant import Plant, nothing_new
 from gridsec.estimators.sequential import design as front_design
 from gridsec.estimators.sequential import init as front_init
 from gridsec.estimators.sequential import meter_bias
 from gridsec.estimators.sequential import state as front_state
-from gridsec.estimators.sequential.attack_kind import classify, forget_readings, ingest, repeat_lags
+from gridsec.estimators.sequential.attack_kind import (
+    AttackKinds,
+    classify,
+    forget_readings,
+    ingest,
+    repeat_lags,
+)
 from gridsec.estimators.sequential.design import SequentialDesign, SequentialOptions
+from gridsec.estimators.sequential.device_checks import BusbarTrust, track_busbar
 from gridsec.estimators.sequential.measurements import (
     Measurements,
     checked,
@@ -58,7 +66,7 @@ from gridsec.estimators.sequential.meter_bias import (
     usable,
 )
 from gridsec.estimators.sequential.output import BoundedEstimate, BoundInputs
-from gridsec.estimators.sequential.posterior import LoadDoubt
+from gridsec.estimators.sequential.posterior import UNMETERED, LoadDoubt
 from gridsec.estimators.sequential.state import Prediction, SequentialState, SuspicionRecord
 from gridsec.estimators.sequential.step import predict
 from gridsec.interface import Estimate, Frame, Verdict
@@ -134,7 +142,7 @@ def design(
     """
     front = front_design(plant, doubt=doubt, step_s=step_s, options=options, max_attacked=max_attacked)
     kernel = core.design(front, most)
-    own = np.linalg.solve(kernel.modes.covariance_b, np.diag(kernel.model.fixed)).T
+    own = np.asarray(np.linalg.solve(kernel.modes.covariance_b, np.diag(kernel.model.fixed)).T, np.float64)
     return ModalDesign(front, kernel, own)
 
 
@@ -249,6 +257,11 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
         None if open_ is None else open_.wide,
     )
     after, evidence = _identified(design, replace(state, front=now, core=kernel), evidence)
+    if not np.array_equal(after.front.busbar.trusted, now.busbar.trusted):
+        # A phase named at this tick is not metered any more.
+        metered = np.asarray(measured.busbar_metered) & after.front.busbar.trusted
+        measured = replace(measured, busbar_metered=metered if metered.size > 1 else bool(metered[0]))
+        open_ = doubts.unknown(front, measured, uncertainty, predicted, skew)
     tick = _Tick(measured, predicted, open_, evidence, m)
     return _answered(design, after, tick)
 
@@ -305,7 +318,62 @@ def _identified(design: ModalDesign, state: ModalState, evidence: Evidence) -> t
         found = replace(suspicion.found, named=confirmed)
         masked, evidence = core.mask(kernel, state.core, replace(suspicion, found=found))
         return replace(after, core=masked, suspicion=None, streak=0 * streak, due=tick + 1), evidence
+    if any_of(phases >= CONFIRM):
+        return _without_busbar(design, after, suspicion, phases >= CONFIRM)
     return after, evidence
+
+
+def _without_busbar(
+    design: ModalDesign, state: ModalState, suspicion: Suspicion, which: Bools
+) -> tuple[ModalState, Evidence]:
+    """State without the readings of some phases of the busbar since the onset.
+
+    which: phases among those with a meter. The kept readings are replayed with a busbar voltage that is
+    unknown from the onset on.
+    """
+    front, kernel, modes = design.front, state.core, design.core.modes
+    H = modes.model.phases(modes.at)
+    named = np.zeros(H.shape[1], dtype=np.bool_)
+    named[H.any(axis=0)] = which
+    columns = doubts.WIDER * UNMETERED * H[:, named]
+    before, known, test, _ = kernel.history.start
+    first = len(kernel.history.readings) - int(kernel.detector.onsets.age[suspicion.row])
+    if first < 0:
+        test = detector.start(modes)
+    parts = before, known, detector.pin(test, np.zeros(0, np.intp)), ()
+    now = replace(
+        core.init(design.core, before.t),
+        filter=before,
+        static=known,
+        detector=parts[2],
+        history=History(parts),
+    )
+    evidence = Evidence(-np.inf, np.full(test.capital.shape, -np.inf))
+    for k, (t, m, seen, unknown) in enumerate(kernel.history.readings):
+        more = unknown if k < first else columns if unknown is None else np.hstack([unknown, columns])
+        now, evidence = core.step(design.core, now, t, m, seen, more)
+    after = replace(
+        state,
+        front=changed(state.front, busbar=_suspected_busbar(front, state.front.busbar, named)),
+        core=replace(now, masked=kernel.masked),
+        suspicion=None,
+        phases=0 * state.phases,
+        due=state.front.ticks + 1,
+    )
+    return after, evidence
+
+
+def _suspected_busbar(front: SequentialDesign, trust: BusbarTrust, named: Bools) -> BusbarTrust:
+    """Trust of the busbar's meter with newly named phases, (b,); the mean of their deviation begins."""
+    return replace(
+        trust,
+        trusted=trust.trusted & ~named,
+        scale=np.where(named, min(1, len(front.lengths) - 1), trust.scale),
+        ticks_suspect=np.where(named, 0, trust.ticks_suspect),
+        ticks_agreeing=np.where(named, 0, trust.ticks_agreeing),
+        off=np.where(named, 0.0, trust.off),
+        named=trust.named | named,
+    )
 
 
 # --- Estimate and verdict ---
@@ -317,13 +385,12 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
     named, seen = kernel.masked.meters, tick.measured.available
     suspected = any_of(kernel.detector.pinned)
     trust = _trust(design, now, named)
-    estimate = _estimate(design, replace(state, front=trust), tick)
+    estimate, of_busbar = _estimate(design, replace(state, front=trust), tick)
+    busbar = _busbar(design, now, tick, estimate, of_busbar)
     evidence = verdict.meter_evidence(
         design.core, kernel, tick.evidence, (tick.m, seen), front.options.widest, state.suspicion
     )
     rivals = verdict.explanations(front, design.core, state.suspicion)
-    b = np.size(tick.measured.busbar_metered)
-    no = np.zeros(b, dtype=np.bool_)
     given = verdict.Inputs(
         frame=tick.measured.frame,
         seen=seen,
@@ -334,9 +401,9 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         explanations=rivals,
         suspicion=state.suspicion,
         settled=_settled(front, tick.predicted),
-        busbar=no,
+        busbar=busbar.named,
         metered=np.atleast_1d(np.asarray(tick.measured.busbar_metered)),
-        busbar_off=np.zeros(b),
+        busbar_off=np.where(busbar.named, busbar.off, 0.0),
     )
     kinds = _kinds(design, state, tick, estimate, named)
     answer = Verdict(
@@ -353,7 +420,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         busbar=given.busbar,
         busbar_attack=given.busbar_off,
     )
-    calm = not (suspected or any_of(named))
+    calm = not (suspected or any_of(named) or any_of(~busbar.trusted))
     kept = (
         record.kept(design.core.modes, state.kept, kernel.filter, kernel.static, now.ticks) if calm else None
     )
@@ -368,6 +435,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         model_driven=tick.predicted.model_driven,
         injection_error=_injection_error(front, now, tick, named),
         attack_kinds=kinds,
+        busbar=busbar,
         learning=learning,
         last=(estimate, answer),
     )
@@ -406,8 +474,21 @@ def _settled(front: SequentialDesign, predicted: Prediction) -> bool:
     return all_of(predicted.transient <= front.options.settled * front.allowed)
 
 
-def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> Estimate:
-    """Voltages by the model and the core, with their standard deviation and bound."""
+def _busbar(
+    design: ModalDesign, now: SequentialState, tick: _Tick, estimate: Estimate, variance: Floats
+) -> BusbarTrust:
+    """Trust of the busbar's meter: a named phase is compared with the estimate until both agree."""
+    if all_of(now.busbar.trusted):
+        return now.busbar
+    measured, front = tick.measured, design.front
+    there = measured.busbar_available & np.isfinite(variance)
+    v0_squared = estimate.v2_bus[front.plant.feeder.busbar_places()]
+    allowed = float(front.allowed.max())
+    return track_busbar(front, now.busbar, measured.busbar_reading, there, v0_squared, variance, allowed)
+
+
+def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Estimate, Floats]:
+    """Voltages by the model and the core, with standard deviation and bound; variance at the busbar, (b,)."""
     front, kernel, measured = design.front, design.core, tick.measured
     plant, now = front.plant, state.front
     errors = core.estimate(kernel, state.core, state.suspicion)
@@ -424,7 +505,7 @@ def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> Estimate:
         mean, variance = mean + more[0], variance + more[1]
     v2_bus, first = tick.predicted.v2_bus + mean, plant.feeder.busbar_places()
     v2_bus[first] = np.where(measured.busbar_metered, measured.v0_squared, v2_bus[first])
-    variance = variance.copy()
+    variance, of_busbar = variance.copy(), variance[first].copy()
     variance[first] = np.maximum(variance[first], np.where(measured.busbar_metered, front.busbar**2, 0.0))
     inputs = BoundInputs(
         plant=plant,
@@ -437,7 +518,8 @@ def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> Estimate:
         checked=_Checked(front, measured.frame),
         sigmas=front.sigmas[0],
     )
-    return BoundedEstimate.of(inputs, measured.frame.t, v2_bus, variance, tick.predicted.x)
+    made = BoundedEstimate.of(inputs, measured.frame.t, v2_bus, variance, tick.predicted.x)
+    return made, np.atleast_1d(of_busbar)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -461,7 +543,7 @@ def own_errors(design: ModalDesign, state: CoreState) -> Floats:
     """
     whole, modes = state.filter.full, design.core.modes
     if whole is not None:
-        return design.own @ whole.mean[1]
+        return np.asarray(design.own @ whole.mean[1])
     felt = modes.directions * (1.0 - state.static.signature[1])[:, None]
     return np.asarray(design.own @ (modes.back @ (state.filter.mean[1] + felt @ state.static.theta)))
 
@@ -477,7 +559,7 @@ def _attack(design: ModalDesign, state: ModalState, tick: _Tick, estimate: Estim
 
 def _kinds(
     design: ModalDesign, state: ModalState, tick: _Tick, estimate: Estimate, named: Bools
-) -> front_state.AttackKinds:
+) -> AttackKinds:
     """Kinds of the named manipulations."""
     front, measured, kernel = design.front, tick.measured, state.core
     references, meters = front.references, front.plant.meters
@@ -544,8 +626,8 @@ def _errors(design: ModalDesign, state: ModalState, done: Bools) -> Learned:
 def renew(design: ModalDesign, state: ModalState, which: Bools) -> ModalState:
     """State after meters `which` (p,) were replaced: trusted again, with their errors to be learned.
 
-    With K of `ModalDesign.own`, a meter's own error is ``K b + r``, r independent of all readings. A new error in
-    its place gives, with A the identity less the rows K of the replaced meters,
+    With K of `ModalDesign.own`, a meter's own error is ``K b + r``, r independent of the readings. A new error
+    in its place gives, with A the identity less the rows K of the replaced meters,
 
         b <- A b,   cov b <- A cov b A' + 2 diag(fixed) - K B K'     in their rows and columns.
 

@@ -1,13 +1,13 @@
 """Answer of one tick: evidence of each meter, verdict with its reason, explanations.
 
-**Score and threshold.** The detector sums over onsets and faults. The part of one meter at the likeliest onset
-alone reaches the limit at
+**Score and threshold.** The detector sums over onsets and faults. The part of one meter at the likeliest
+onset alone reaches the limit at
 
     s^2 y^2 / (2 (1 + s^2 F)) - log(1 + s^2 F) / 2 >= log gamma - log(weight capital / p),
 
-y and F being its score and its information. The score shown is the amount ``|y| / F``, the threshold the amount
-at equality. The sum may reach the limit before any of its parts does. For a masked meter the score is the
-distance of its reading from the filter without it, the threshold that of the release.
+y and F being its score and its information. The score shown is the amount ``|y| / F``, the threshold the
+amount at equality. The sum may reach the limit before any of its parts does. For a masked meter the score is
+the distance of its reading from the filter without it, the threshold that of the release.
 
 **Decision.** ATTACKED: a meter is named, or the busbar's. UNDECIDED: log M was beyond the limit since the
 suspected onset, and no meter is named; too few meters; unread powers that leave a voltage too uncertain.
@@ -73,7 +73,7 @@ class MeterEvidence:
     row: int
 
 
-def meter_evidence(
+def meter_evidence(  # noqa: PLR0917  # the core, one tick, and one limit
     core: Core,
     state: CoreState,
     evidence: Evidence,
