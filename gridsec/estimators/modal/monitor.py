@@ -626,7 +626,7 @@ def _errors(design: ModalDesign, state: ModalState, done: Bools) -> Learned:
 def renew(design: ModalDesign, state: ModalState, which: Bools) -> ModalState:
     """State after meters `which` (p,) were replaced: trusted again, with their errors to be learned.
 
-    With K of `ModalDesign.own`, a meter's own error is ``K b + r``, r independent of the readings. A new error
+    With K of `ModalDesign.own`, a meter's own error is ``K b + r``, r independent of readings. A new error
     in its place gives, with A the identity less the rows K of the replaced meters,
 
         b <- A b,   cov b <- A cov b A' + 2 diag(fixed) - K B K'     in their rows and columns.
