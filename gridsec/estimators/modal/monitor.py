@@ -47,6 +47,7 @@ from gridsec.estimators.sequential.attack_kind import (
 from gridsec.estimators.sequential.design import SequentialDesign, SequentialOptions
 from gridsec.estimators.sequential.device_checks import BusbarTrust, track_busbar
 from gridsec.estimators.sequential.measurements import (
+    FrameUncertainty,
     Measurements,
     checked,
     measurements,
@@ -78,6 +79,8 @@ LOOKS = 16
 """Searches per age of the suspected onset: explanations change ever more slowly."""
 SETTLING = 32
 """Largest number of ticks at the start of a run that the core gives up for complete readings."""
+JUMP = 6.0
+"""Standard deviations of an innovation beyond which a reading does not drive an inverter, 1."""
 PAUSE = 60.0
 """Ticks without a frame that count as a pause for the time of commissioning."""
 
@@ -229,7 +232,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     uncertainty = update_uncertainty(
         front, given.uncertainty, frame, measured.available, measured.busbar_metered
     )
-    predicted = predict(front, given, measured, uncertainty.sizes)
+    given, measured, predicted = _driven(design, state, given, measured, uncertainty)
     v2 = predicted.v2_bus[front.prior.meters]
     skew = given.clock_skew
     if skew is not None or frame.clock_offset is not None:
@@ -264,6 +267,35 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
         open_ = doubts.unknown(front, measured, uncertainty, predicted, skew)
     tick = _Tick(measured, predicted, open_, evidence, m)
     return _answered(design, after, tick)
+
+
+def _driven(
+    design: ModalDesign,
+    state: ModalState,
+    given: SequentialState,
+    measured: Measurements,
+    uncertainty: FrameUncertainty,
+) -> tuple[SequentialState, Measurements, Prediction]:
+    """Front end, measurements and prediction without inverters driven by a reading that jumps.
+
+    A manipulated reading that drives an inverter of the model moves the residuals of all others. A reading
+    beyond `JUMP` standard deviations of its innovation therefore counts as not trusted at this tick.
+    """
+    front, kernel = design.front, state.core
+    predicted = predict(front, given, measured, uncertainty.sizes)
+    if kernel.update is None or not front.meter_of.size or given.x is None:
+        return given, measured, predicted
+    m = measured.y - predicted.v2_bus[front.prior.meters]
+    off, std = verdict.deviations(design.core, kernel, m)
+    drives = np.zeros(m.size, dtype=np.bool_)
+    drives[front.meter_of[front.meter_of >= 0]] = True
+    jumps = drives & measured.available & given.trust.trusted & (np.abs(off) > JUMP * std)
+    if not any_of(jumps):
+        return given, measured, predicted
+    trusted = given.trust.trusted & ~jumps
+    given = changed(given, trust=replace(given.trust, trusted=trusted))
+    measured = measurements(front, measured.frame, trusted, given.busbar.trusted, given.v0_squared)
+    return given, measured, predict(front, given, measured, uncertainty.sizes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -384,7 +416,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
     front, kernel, now = design.front, state.core, state.front
     named, seen = kernel.masked.meters, tick.measured.available
     suspected = any_of(kernel.detector.pinned)
-    trust = _trust(design, now, named)
+    trust = _trust(design, now, named, state.suspicion)
     estimate, of_busbar = _estimate(design, replace(state, front=trust), tick)
     busbar = _busbar(design, now, tick, estimate, of_busbar)
     evidence = verdict.meter_evidence(
@@ -433,7 +465,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         ticks=now.ticks + 1,
         x=tick.predicted.x,
         model_driven=tick.predicted.model_driven,
-        injection_error=_injection_error(front, now, tick, named),
+        injection_error=_injection_error(front, now, tick, trust.trust.trusted),
         attack_kinds=kinds,
         busbar=busbar,
         learning=learning,
@@ -443,29 +475,33 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
     return (out if learning is None else _learned(design, out)), estimate, answer
 
 
-def _trust(design: ModalDesign, now: SequentialState, named: Bools) -> SequentialState:
-    """Front end that trusts all meters but the named ones."""
-    trust = now.trust
-    if np.array_equal(trust.named, named):
+def _trust(
+    design: ModalDesign, now: SequentialState, named: Bools, suspicion: Suspicion | None
+) -> SequentialState:
+    """Front end that trusts all meters but those that are named or that a likely explanation accuses."""
+    trust, out = now.trust, named
+    if suspicion is not None:
+        out = named | verdict.accused(design.core, suspicion)
+    if np.array_equal(trust.named, named) and np.array_equal(trust.trusted, ~out):
         return now
     longest = len(design.front.lengths) - 1
     return changed(
         now,
         trust=replace(
             trust,
-            trusted=~named,
+            trusted=~out,
             named=named,
-            scale=np.where(named, longest, trust.scale),
+            scale=np.where(out, longest, trust.scale),
             repeat_lag=np.where(named, trust.repeat_lag, 0),
         ),
     )
 
 
 def _injection_error(
-    front: SequentialDesign, now: SequentialState, tick: _Tick, named: Bools
+    front: SequentialDesign, now: SequentialState, tick: _Tick, trusted: Bools
 ) -> front_state.InjectionError:
-    """Errors of the injections: unknown where a meter named at this tick drove the inverter."""
-    new, error = now.trust.trusted & named, tick.predicted.injection_error
+    """Errors of the injections: unknown where a meter accused at this tick drove the inverter."""
+    new, error = now.trust.trusted & ~trusted, tick.predicted.injection_error
     return error.reset((front.meter_of >= 0) & new[front.meter_of]) if any_of(new) else error
 
 
@@ -568,7 +604,7 @@ def _kinds(
     variance = np.maximum(estimate.std[meters] ** 2 + front.white, front.white)
     if any_of(named):
         expected = expected + own_errors(design, kernel)
-        variance = verdict.masked_deviations(design.core, kernel, tick.m)[1] ** 2
+        variance = verdict.deviations(design.core, kernel, tick.m)[1] ** 2
     return classify(references, state.front.attack_kinds, expected, own, named, variance)
 
 
@@ -705,7 +741,8 @@ def distrusted(design: ModalDesign, state: ModalState) -> SuspicionRecord:
 
 
 def warm_start(design: ModalDesign, state: ModalState, before: SuspicionRecord) -> ModalState:
-    """State from `init` with the suspects of an earlier run: masked from the first reading on."""
+    """State from `init` with the named meters of an earlier run: masked from the first reading on."""
+    before = replace(before, scale_s=np.where(before.named, before.scale_s, np.nan))
     if before.is_empty:
         return state
     front = front_state.warm_start(design.front, state.front, before)

@@ -430,9 +430,13 @@ def _explored(problem: SearchProblem, groups: tuple[Ints, ...]) -> tuple[SearchP
     """The problem with the estimated prior size, and all sets that were met with their costs."""
     start = relevant(problem)
     best = _best((Tableau(problem), _at(problem, start)), groups)
-    sized = _sized(problem, best.chosen)
-    if sized is not problem:
-        problem, best = sized, _best((_at(sized, best.chosen), _at(sized, start)), groups)
+    ends = [
+        (sized, _best((_at(sized, best.chosen), _at(sized, start)), groups))
+        for sized in (_sized(problem, best.chosen), _sized(problem, start))
+        if sized is not problem
+    ]
+    if ends:
+        problem, best = min(ends, key=lambda end: end[1].cost)
     found = {best.chosen.tobytes(): best.cost}
 
     def keep(tableau: Tableau) -> None:

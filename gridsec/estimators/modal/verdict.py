@@ -117,29 +117,36 @@ def meter_evidence(  # noqa: PLR0917  # the core, one tick, and one limit
         tested = tested | (seen & ~update.seen)
     if any_of(state.masked.meters) and full is not None:
         out = state.masked.meters
-        off, std = masked_deviations(core, state, m)
+        off, std = deviations(core, state, m)
         score = np.where(out & seen, np.abs(off), score)
         threshold = np.where(out, masking.OUTLIER * std, threshold)
         tested = tested | (out & seen)
     return MeterEvidence(score, threshold, tested, row)
 
 
-def masked_deviations(core: Core, state: CoreState, m: Floats) -> tuple[Floats, Floats]:
+def deviations(core: Core, state: CoreState, m: Floats) -> tuple[Floats, Floats]:
     """Deviation of every reading from the filter, and its standard deviation for a meter that is not read.
 
     Parameters
     ----------
     core, state
-        The core, and the state after a tick with a full covariance.
+        The core, and the state after a tick.
     m : (p,)
         Residuals.
     """
-    full, t = state.filter.full, core.modes.size
+    full, made = state.filter.full, core.modes
+    t = made.size
     if full is None:
-        return np.zeros(t), np.zeros(t)
+        felt = 1.0 - state.static.signature[0] - state.static.signature[1]
+        spread = made.back @ (felt[:, None] * made.directions)
+        mean = made.back @ state.filter.mean.sum(axis=0) + spread @ state.static.theta
+        P = state.filter.cov
+        variance = (made.back * made.back) @ (P[0] + 2.0 * P[1] + P[2] + 1.0)
+        variance += np.einsum("jr,rs,js->j", spread, state.static.cov, spread)
+        return m - mean, np.sqrt(variance)
     P = full.cov
     slow = np.diag(P[:t, :t]) + 2.0 * np.diag(P[:t, t:]) + np.diag(P[t:, t:])
-    return m - full.mean[0] - full.mean[1], np.sqrt(slow + core.modes.noise.diagonal())
+    return m - full.mean[0] - full.mean[1], np.sqrt(slow + made.noise.diagonal())
 
 
 def _row(state: CoreState, evidence: Evidence, suspicion: Suspicion | None) -> int:
