@@ -20,7 +20,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid, Problem
-from gridsec.estimators.modal import detector, full, masking, replay, signatures, static
+from gridsec.estimators.modal import detector, full, masking, replay, rivals, signatures, static
 from gridsec.estimators.modal import estimate as estimates
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.detector import SIZE, Detector, Evidence
@@ -29,6 +29,7 @@ from gridsec.estimators.modal.filter import FilterState, Update
 from gridsec.estimators.modal.masking import Masked
 from gridsec.estimators.modal.model import Modes, ResidualModel, modes, residual_model
 from gridsec.estimators.modal.replay import History, Parts, Suspected
+from gridsec.estimators.modal.rivals import Rival
 from gridsec.estimators.modal.search import Identification, SearchProblem, cost, groups, search
 from gridsec.estimators.modal.signatures import Columns, Joint
 from gridsec.estimators.modal.static import Static
@@ -36,14 +37,16 @@ from gridsec.estimators.sequential.design import YEAR_S, SequentialDesign
 from gridsec.estimators.sequential.state import SequentialState
 from gridsec.grid.network import Power
 
-ACCUSATIONS = 5.0
+ACCUSATIONS = 1.0
 """Charge of a false power, in accusations of a meter: powers are promised to be within their limits."""
 FALSE_POWER = 0.05
 """Prior standard deviation of a false power, pu of the feeder's base: 5 kW at 100 kVA, a large appliance."""
 MOST_POWER = 3.0
 """Largest false power, in those that the customer can have, 1. False reports stay near the possible."""
-SHOCK = 10.0
-"""Variance of an unreported change of all loads, in those of the loads, 1: 2 kW where 0.6 kW is stated."""
+PRIOR = 0.5
+"""Prior probability that the loads' errors are as stated, 1; the rivals share the rest alike."""
+HOPELESS = 60.0
+"""Cost of a rival above the model from which on it is not searched, 1: sets may lower it by far less."""
 CONNECTION = 0.1
 """Power of a customer where the files are not asked, pu of the feeder's base: 10 kW at 100 kVA."""
 FARTHER = 5.0
@@ -74,6 +77,8 @@ class Core:
         Largest amount of each fault that is possible.
     limit
         Log gamma: the alarm is at log M >= limit.
+    rivals
+        Modes under other models of the loads.
     """
 
     model: ResidualModel
@@ -84,6 +89,7 @@ class Core:
     estimator: Estimator = field(repr=False)
     bound: Floats = field(repr=False)
     limit: float
+    rivals: tuple[Modes, ...] = field(repr=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,6 +108,8 @@ class CoreState:
         Exact scores of the pinned onsets, where the filter has a full covariance.
     masked
         Masked meters.
+    rivals
+        The model and its rivals since the start of the kept readings, with the likeliest of the pinned onsets.
     """
 
     filter: FilterState
@@ -111,6 +119,7 @@ class CoreState:
     history: History
     suspected: tuple[Suspected, ...]
     masked: Masked
+    rivals: tuple[Rival, ...] = ()
 
 
 def assemble(model: ResidualModel, powers: Floats, most: Floats, *, gamma: float) -> Core:
@@ -146,6 +155,7 @@ def assemble(model: ResidualModel, powers: Floats, most: Floats, *, gamma: float
         estimator=estimates.estimator(made),
         bound=np.concatenate([np.full(at.size, inf), MOST_POWER * most, np.full(int(used.sum()), inf)]),
         limit=log(gamma),
+        rivals=rivals.rivals(made),
     )
 
 
@@ -230,16 +240,18 @@ def step(
         if pinned and not suspected:
             suspected = replay.carried(made, state.detector.onsets, state.static, pinned)
         suspected = tuple(replay.follow(made, each, update.exact, h) for each in suspected)
+    others = tuple(rivals.follow(each, t, m, seen) for each in state.rivals)
     if evidence.log_m >= core.limit and (not pinned or (suspected and _elsewhere(evidence, pinned))):
         test = detector.pin(test, evidence.rows)
+        last = replay.record(state.history, (after, known, test, ()), m, seen)
+        others = rivals.replayed(made, core.rivals, last, test.onsets, int(evidence.rows[0]))
         if update.exact is not None:
-            last = replay.record(state.history, (after, known, test, ()), m, seen)
             rows = np.flatnonzero(test.pinned).tolist()
             suspected = replay.replayed(made, last, test.onsets, rows)
     elif pinned and evidence.log_m < CALM * core.limit:
-        test, suspected = detector.pin(test, evidence.rows[:0]), ()
+        test, suspected, others = detector.pin(test, evidence.rows[:0]), (), ()
     history = replay.record(state.history, (after, known, test, suspected), m, seen)
-    return CoreState(after, known, test, update, history, suspected, masked), evidence
+    return CoreState(after, known, test, update, history, suspected, masked, others), evidence
 
 
 def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState, Evidence]:
@@ -347,11 +359,15 @@ def _joint(core: Core, parts: Parts, row: int) -> Joint:
 
 
 def _searched(core: Core, state: CoreState, row: int) -> Identification:
-    """Explanations since one onset, with and without an unreported change of all loads."""
-    now = _joint(core, _parts(state), row)
-    other, ratio = signatures.shocked(core.modes, now, SHOCK)
-    charge = ACCUSATIONS * 2.0 * log(core.modes.size)
-    return search(_problem(core, now), core.groups, (_problem(core, other), charge - 2.0 * ratio))
+    """Explanations since one onset, under the model and under its rivals."""
+    model = _problem(core, _joint(core, _parts(state), row))
+    if not state.rivals:
+        return search(model, core.groups)
+    plain, others = state.rivals[0], state.rivals[1:]
+    less = 2.0 * log(PRIOR * len(others) / (1.0 - PRIOR))
+    costs = [2.0 * (plain.evidence - each.evidence) + less for each in others]
+    problems = [_problem(core, each.joint()) for each in others]
+    return search(model, core.groups, list(zip(problems, costs, strict=True)))
 
 
 def _problem(core: Core, joint: Joint) -> SearchProblem:
@@ -386,9 +402,12 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     plain = estimates.honest(made, by, state.filter, state.static, state.update)
     if suspicion is None:
         return plain
-    # A change of all loads is one more fault for each mode, with an effect on all places.
-    W = np.hstack([core.faults.W, np.eye(made.size)])
-    effect = np.hstack([core.effect, by.of_w])
     now = _joint(core, _parts(state), suspicion.row)
-    T = estimates.moves(made, by, state.filter, now, W, effect)
-    return estimates.corrected(plain, T, suspicion.found, (*now.of(W), np.sqrt(SHOCK * made.loads)))
+    before, T = [plain], [estimates.moves(made, by, state.filter, now, core.faults.W, core.effect)]
+    for each in state.rivals[1:]:
+        assert each.update is not None
+        before.append(
+            estimates.honest(each.modes, by, each.filter, each.static, each.update, loads=each.loads)
+        )
+        T.append(estimates.moves(each.modes, by, each.filter, each.joint(), core.faults.W, core.effect))
+    return estimates.corrected(before, T, suspicion.found)

@@ -118,7 +118,7 @@ def replayed(modes: Modes, history: History, onsets: Onsets, rows: Sequence[int]
     """
     count, (state, known, *_) = len(history.readings), history.start
     t, full = state.t, exact.expanded(modes, state, known) if state.full is None else state.full
-    out = {row: _begun(modes, row, bool(onsets.ramp[row])) for row in rows}
+    out = {row: begun(modes, row, bool(onsets.ramp[row])) for row in rows}
     for k, (now, m, seen) in enumerate(history.readings):
         h = now - t
         full, innovation = exact.updated(modes, full, h, m, seen)
@@ -129,8 +129,14 @@ def replayed(modes: Modes, history: History, onsets: Onsets, rows: Sequence[int]
     return tuple(out.values())
 
 
-def _begun(modes: Modes, row: int, ramp: bool) -> Suspected:
-    """Scores before the onset."""
+def begun(modes: Modes, row: int, ramp: bool) -> Suspected:
+    """Scores before the onset.
+
+    Parameters
+    ----------
+    modes, row, ramp
+        The modes, the row of the onset and its shape.
+    """
     t = modes.size
     return Suspected(row, ramp, float(not ramp), np.zeros((2 * t, t)), np.zeros(t), np.zeros((t, t)))
 

@@ -34,6 +34,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from math import inf, log
 
@@ -116,18 +117,18 @@ class Identification:
     ----------
     chosen : (k, q)
         The sets.
-    shock : (k,)
-        Explanations in which all loads have changed at the onset as well.
+    model : (k,)
+        Number of the problem of each: 0, or that of a rival model of the loads.
     weight : (k,)
         Their posterior weights; they sum to 1.
     named : (p,)
         Meters without which nothing explains the readings.
     problems
-        The problem with the estimated prior size, and that with a change of all loads integrated out.
+        The problem with the estimated prior size, and those of the rivals.
     """
 
     chosen: Bools
-    shock: Bools
+    model: Ints
     weight: Floats
     named: Bools
     problems: tuple[SearchProblem, ...]
@@ -406,7 +407,9 @@ def relevant(problem: SearchProblem) -> Bools:
 
 
 def search(
-    problem: SearchProblem, groups: tuple[Ints, ...] = (), shocked: tuple[SearchProblem, float] | None = None
+    problem: SearchProblem,
+    groups: tuple[Ints, ...] = (),
+    rivals: Sequence[tuple[SearchProblem, float]] = (),
 ) -> Identification:
     """Find the likeliest sets and the meters without which nothing explains the readings.
 
@@ -416,14 +419,15 @@ def search(
         The problem.
     groups
         Groups of neighbours, places of meters.
-    shocked
-        The problem with a change of all loads integrated out, and the cost of that change by itself.
+    rivals
+        The problem under other models of the loads, and the cost of each by itself.
     """
-    plain, found = _explored(problem, groups)
-    if shocked is None:
-        return _identified((plain,), (found,))
-    other, more = _explored(shocked[0], groups)
-    return _identified((plain, other), (found, {key: each + shocked[1] for key, each in more.items()}))
+    explored = [_explored(each, groups) for each in (problem, *(each for each, _ in rivals))]
+    more = (0.0, *(cost for _, cost in rivals))
+    found = tuple(
+        {key: each + cost for key, each in sets.items()} for (_, sets), cost in zip(explored, more, strict=True)
+    )
+    return _identified(tuple(each for each, _ in explored), found)
 
 
 def _explored(problem: SearchProblem, groups: tuple[Ints, ...]) -> tuple[SearchProblem, dict[bytes, float]]:
@@ -537,8 +541,8 @@ def _identified(problems: tuple[SearchProblem, ...], found: tuple[dict[bytes, fl
     chosen = np.stack([np.frombuffer(key, dtype=np.bool_) for _, _, key in every])[kept]
     weight = weight[kept] / weight[kept].sum()
     without = weight @ ~chosen[:, : problems[0].meters]
-    shock = np.array([k > 0 for _, k, _ in every])[kept]
-    return Identification(chosen, shock, weight, np.asarray(without < DOUBT), problems)
+    model = np.array([k for _, k, _ in every])[kept]
+    return Identification(chosen, model, weight, np.asarray(without < DOUBT), problems)
 
 
 def groups(modes: Modes) -> tuple[Ints, ...]:
