@@ -5,6 +5,7 @@
     step(core, state, t, m, seen) -> (CoreState, Evidence)      every tick, releases masked meters
     identify(core, state, evidence) -> Suspicion                where `alarmed`
     mask(core, state, suspicion) -> (CoreState, Evidence)       where meters are named
+    adopt(core, state, suspicion) -> CoreState                  where loads alone explain the readings
     estimate(core, state, suspicion) -> Estimated               where asked for
 
 The front end is that of `gridsec.estimators.sequential`: cleaning of frames, observer of the inverters,
@@ -30,7 +31,7 @@ from gridsec.estimators.modal.masking import Masked
 from gridsec.estimators.modal.model import Modes, ResidualModel, modes, residual_model
 from gridsec.estimators.modal.replay import History, Parts, Suspected
 from gridsec.estimators.modal.rivals import Rival
-from gridsec.estimators.modal.search import Identification, SearchProblem, cost, groups, search
+from gridsec.estimators.modal.search import DOUBT, Identification, SearchProblem, cost, groups, search
 from gridsec.estimators.modal.signatures import Columns, Joint
 from gridsec.estimators.modal.static import Static
 from gridsec.estimators.sequential.design import YEAR_S, SequentialDesign
@@ -45,8 +46,6 @@ MOST_POWER = 3.0
 """Largest false power, in those that the customer can have, 1. False reports stay near the possible."""
 PRIOR = 0.5
 """Prior probability that the loads' errors are as stated, 1; the rivals share the rest alike."""
-HOPELESS = 60.0
-"""Cost of a rival above the model from which on it is not searched, 1: sets may lower it by far less."""
 CONNECTION = 0.1
 """Power of a customer where the files are not asked, pu of the feeder's base: 10 kW at 100 kVA."""
 FARTHER = 5.0
@@ -273,7 +272,8 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
     if first < 0:
         begun = _joint(core, history.start, suspicion.row)
         whole = before.full or full.expanded(core.modes, before, known)
-        before = replace(before, full=replay.freed(core.modes, whole, begun, named))
+        W = core.faults.W[:, : named.size][:, named]
+        before = replace(before, full=replay.freed(core.modes, whole, begun, W, np.ones(W.shape[1])))
         test = detector.start(core.modes)
     test = detector.pin(test, np.zeros(0, np.intp))
     parts = before, known, test
@@ -283,6 +283,33 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
         read = seen if k < first else ~named if seen is None else seen & ~named
         now, evidence = step(core, now, t, m, read)
     return replace(now, masked=masking.added(state.masked, named)), evidence
+
+
+def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
+    """Go on with the likeliest model of the loads, where no explanation of weight needs a meter.
+
+    The filter becomes that of the rival, with the powers of the best explanation unknown since the onset. The
+    detector starts anew. The state is unchanged where meters are doubted.
+
+    Parameters
+    ----------
+    core, state
+        The core, and the state after a tick.
+    suspicion
+        The explanations after the same tick.
+    """
+    found, p = suspicion.found, core.modes.size
+    free = ~found.chosen[:, :p].any(axis=1)
+    if not free[0] or float(found.weight[~free].sum()) >= DOUBT or not state.rivals:
+        return state
+    rival = state.rivals[int(found.model[0])]
+    after, chosen = rival.filter, found.chosen[0]
+    if chosen.any():
+        whole = after.full or full.expanded(rival.modes, after, rival.static)
+        W, std = core.faults.W[:, chosen], found.problems[int(found.model[0])].std[chosen]
+        after = replace(after, full=replay.freed(rival.modes, whole, rival.joint(), W, std))
+    parts = after, rival.static, detector.start(core.modes)
+    return CoreState(*parts, rival.update, History((*parts, ())), (), state.masked)
 
 
 def _elsewhere(evidence: Evidence, pinned: list[int]) -> bool:

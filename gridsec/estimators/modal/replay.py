@@ -193,10 +193,10 @@ def follow(modes: Modes, before: Suspected, innovation: Innovation, h: float) ->
     )
 
 
-def freed(modes: Modes, full: Full, joint: Joint, faults: Bools) -> Full:
-    """The exact filter with the amounts of the faults of some members unknown since the onset; O(t^2 f).
+def freed(modes: Modes, full: Full, joint: Joint, W: Floats, std: Floats) -> Full:
+    """The exact filter with the amounts of some faults unknown since the onset; O(t^2 f).
 
-    With y, F and X of these faults, the means lose ``X (F + 1)^-1 y`` and P gains ``X (F + 1)^-1 X'``.
+    With y, F and X of these faults, the means lose ``X (F + 1 / s^2)^-1 y`` and P gains ``X (F + 1 / s^2)^-1 X'``.
 
     Parameters
     ----------
@@ -204,11 +204,12 @@ def freed(modes: Modes, full: Full, joint: Joint, faults: Bools) -> Full:
         The modes, and the exact filter.
     joint
         Joint scores of the onset after the same tick.
-    faults : (t,)
-        The members.
+    W : (t, f)
+        Columns of the faults in the modes.
+    std : (f,)
+        Prior standard deviations of their amounts.
     """
-    W = modes.U.T[:, faults]
     y, F = joint.of(W)
     X = np.vstack([modes.back @ joint.shift[0] @ W, modes.back @ joint.shift[1] @ W])
-    gain = np.linalg.solve(F + np.eye(y.size), X.T).T
+    gain = np.linalg.solve(F + np.diag(std**-2.0), X.T).T
     return replace(full, mean=full.mean - (gain @ y).reshape(2, -1), cov=full.cov + gain @ X.T)

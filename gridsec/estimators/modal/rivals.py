@@ -41,7 +41,7 @@ from gridsec.estimators.modal.replay import History, Suspected
 from gridsec.estimators.modal.signatures import Joint, Onsets
 from gridsec.estimators.modal.static import Static
 
-UNREST = (1.0, 10.0, 100.0)
+UNREST = (1.0, 30.0)
 """Variances of the loads' changes of the rivals, in those of the model, 1."""
 JUMPS = (10.0, 100.0)
 """Variances of a jump of all loads, in those of the loads, 1: 2 and 6 kW where 0.6 kW is stated."""

@@ -93,11 +93,12 @@ def test_loads_that_jump_accuse_no_honest_meter(kind: str, liar: bool) -> None:
         seen[100:] = random.random((160, 12)) > 0.2
     alarms = 0
     for k in range(260):
-        m = source.tick() + STEPS @ jumps[k] + 0.04 * (liar and k >= 180) * np.eye(12)[LIAR]
+        m = source.tick() + STEPS @ jumps[k] + 0.04 * (liar and k >= 130) * np.eye(12)[LIAR]
         state, evidence = core.step(kernel, state, float(k), m, seen[k])
         if core.alarmed(kernel, evidence) and k % 8 == 7:
             alarms += 1
-            named = core.identify(kernel, state, evidence).found.named
+            suspicion = core.identify(kernel, state, evidence)
+            named, state = suspicion.found.named, core.adopt(kernel, state, suspicion)
             assert not named[np.arange(12) != LIAR].any()
     assert alarms
     assert named[LIAR] == liar
