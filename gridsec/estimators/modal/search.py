@@ -40,9 +40,9 @@ from math import inf, log
 
 import numpy as np
 from scipy.cluster.hierarchy import linkage
-from scipy.linalg import blas, cho_solve, cholesky, lapack
+from scipy.linalg import blas, cho_solve, cholesky, lapack, solve_triangular
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, submatrix
 from gridsec.estimators.modal.model import Modes
 
 DOUBT = 1e-3
@@ -219,10 +219,19 @@ def padded(sets: Bools) -> tuple[Ints, Bools]:
 
 def _fits(A: Floats, v: Floats) -> tuple[Floats, Floats]:
     """``log det A`` and ``v' A^-1 v`` of stacked positive definite matrices, (k,) each."""
-    half = np.linalg.cholesky(A)
-    white = np.linalg.solve(half, v[..., None])[..., 0]
-    diagonal = np.einsum("kii->ki", half)
+    # The last row of the Cholesky factor of [A, v; v', c] is (half^-1 v)', for any c that is large enough.
+    k, n = v.shape
+    bordered = np.empty((k, n + 1, n + 1))
+    bordered[:, :n, :n] = A
+    bordered[:, n, :n] = bordered[:, :n, n] = v
+    bordered[:, n, n] = _HUGE
+    half = np.linalg.cholesky(bordered)
+    white, diagonal = half[:, n, :n], np.einsum("kii->ki", half)[:, :n]
     return 2.0 * np.log(diagonal).sum(axis=1), (white * white).sum(axis=1)
+
+
+_HUGE = 1e200
+"""Above all ``v' A^-1 v``."""
 
 
 def amounts(problem: SearchProblem, chosen: Bools) -> tuple[Floats, Floats]:
@@ -261,6 +270,31 @@ class Tableau:
         self.barred = np.zeros(q, dtype=np.bool_)
         self.cost = 0.0
         self.size = 2.0 * np.log(problem.std)
+
+    def pivot(self, chosen: Bools) -> Tableau:
+        """The same, pivoted on a set in place of none; O(q^2 k).
+
+        Parameters
+        ----------
+        chosen : (q,)
+            The set.
+        """
+        J, N = np.flatnonzero(chosen), np.flatnonzero(~np.append(chosen, False))
+        if not J.size:
+            return self
+        half, _ = lapack.dpotrf(submatrix(self.A, J, J), lower=True, clean=True)
+        white = solve_triangular(half, submatrix(self.A, J, N), lower=True, check_finite=False)
+        inverse, _ = lapack.dpotri(half, lower=True)
+        inverse = np.tril(inverse) + np.tril(inverse, -1).T
+        self.A[np.ix_(N, N)] -= white.T @ white
+        beside = solve_triangular(half, white, lower=True, trans=1, check_finite=False)
+        self.A[np.ix_(J, N)], self.A[np.ix_(N, J)] = beside, beside.T
+        self.A[np.ix_(J, J)] = -inverse
+        self.cost = 2.0 * float(np.log(half.diagonal()).sum()) - float(white[:, -1] @ white[:, -1])
+        self.cost += float(self.size[J].sum() + self.problem.charge[J].sum())
+        self.chosen = chosen.copy()
+        self.cost += float(self.penalty[self.count])
+        return self
 
     def copy(self) -> Tableau:
         """A tableau that can be changed without changing this one."""
@@ -556,10 +590,7 @@ def _best(starts: tuple[Tableau, ...], groups: Groups) -> Tableau:
 
 def _at(problem: SearchProblem, chosen: Bools) -> Tableau:
     """A tableau pivoted on a set."""
-    out = Tableau(problem)
-    for j in np.flatnonzero(chosen):
-        out.toggle(int(j))
-    return out
+    return Tableau(problem).pivot(chosen)
 
 
 def _sized(problem: SearchProblem, chosen: Bools) -> SearchProblem:

@@ -86,6 +86,9 @@ def test_costs_changes_and_exchanges_are_exact(seed: int) -> None:
             assert not same or tableau.cost + change[0] == pytest.approx(s.cost(given, other), abs=1e-7)
             assert same or np.isinf(change[0])
     assert np.isfinite(tableau.A).all()
+    again = Tableau(given).pivot(tableau.chosen)
+    assert np.allclose(again.A, tableau.A, atol=1e-8 * np.abs(tableau.A).max())
+    assert again.cost == pytest.approx(tableau.cost, abs=1e-8)
 
 
 @pytest.mark.parametrize("seed", range(8))
