@@ -40,7 +40,7 @@ from math import exp
 import numpy as np
 from scipy.linalg import blas, lapack
 
-from gridsec.arrays import Bools, Floats, all_of, indices, submatrix
+from gridsec.arrays import Bools, Floats, Ints, all_of, indices, submatrix
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal import static
 from gridsec.estimators.modal.filter import FilterState, Full, Innovation, Update
@@ -181,6 +181,27 @@ def updated(  # noqa: PLR0917  # the filter, and one tick
     precision = np.zeros(t)
     precision[rows] = (inverse * inverse).sum(axis=0)
     return Full(mean, P, seen, before.kept, complete), Innovation(rows, half, gain, white, precision)
+
+
+def expected(modes: Modes, before: Full, h: float, rows: Ints) -> Floats:
+    """Covariance of the innovation of the next tick, (n, n).
+
+    Parameters
+    ----------
+    modes, before
+        The modes, and the filter after the last tick.
+    h
+        Interval, s.
+    rows : (n,)
+        Members with a reading.
+    """
+    rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
+    P, w, b = before.cov, rows, modes.size + rows
+    V = rho * rho * submatrix(P, w, w) + rho_b * rho_b * submatrix(P, b, b)
+    V += rho * rho_b * (submatrix(P, w, b) + submatrix(P, b, w)) + submatrix(modes.noise, rows, rows)
+    V += (1.0 - rho * rho) * submatrix(modes.covariance_w, rows, rows)
+    V += (1.0 - rho_b * rho_b) * submatrix(modes.covariance_b, rows, rows)
+    return V
 
 
 def _kept(modes: Modes, kept: Floats, update: Update) -> tuple[Floats, Floats]:

@@ -352,6 +352,11 @@ def _identified(design: ModalDesign, state: ModalState, evidence: Evidence) -> t
         return replace(after, core=masked, suspicion=None, streak=0 * streak, due=tick + 1), evidence
     if any_of(phases >= CONFIRM):
         return _without_busbar(design, after, suspicion, phases >= CONFIRM)
+    if not any_of(suspicion.found.chosen[0]):
+        # Loads have changed, and no power is false.
+        adopted = core.adopt(kernel, state.core, suspicion)
+        if adopted is not state.core:
+            return replace(after, core=adopted, suspicion=None), evidence
     return after, evidence
 
 

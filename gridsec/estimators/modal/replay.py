@@ -123,7 +123,7 @@ def replayed(modes: Modes, history: History, onsets: Onsets, rows: Sequence[int]
     """
     count, (state, known, *_) = len(history.readings), history.start
     t, full = state.t, exact.expanded(modes, state, known) if state.full is None else state.full
-    out = {row: _begun(modes, row, bool(onsets.ramp[row])) for row in rows}
+    out = {row: begun(modes, row, bool(onsets.ramp[row])) for row in rows}
     for k, (now, m, seen, unknown) in enumerate(history.readings):
         h = now - t
         full, innovation = exact.updated(modes, full, h, m, seen, unknown)
@@ -134,8 +134,14 @@ def replayed(modes: Modes, history: History, onsets: Onsets, rows: Sequence[int]
     return tuple(out.values())
 
 
-def _begun(modes: Modes, row: int, ramp: bool) -> Suspected:
-    """Scores before the onset."""
+def begun(modes: Modes, row: int, ramp: bool) -> Suspected:
+    """Scores before the onset.
+
+    Parameters
+    ----------
+    modes, row, ramp
+        The modes, the row of the onset and its shape.
+    """
     t = modes.size
     return Suspected(row, ramp, float(not ramp), np.zeros((2 * t, t)), np.zeros(t), np.zeros((t, t)))
 
@@ -192,10 +198,10 @@ def follow(modes: Modes, before: Suspected, innovation: Innovation, h: float) ->
     )
 
 
-def freed(modes: Modes, full: Full, joint: Joint, faults: Bools) -> Full:
-    """The exact filter with the amounts of the faults of some members unknown since the onset; O(t^2 f).
+def freed(modes: Modes, full: Full, joint: Joint, W: Floats, std: Floats) -> Full:
+    """The exact filter with the amounts of some faults unknown since the onset; O(t^2 f).
 
-    With y, F and X of these faults, the means lose ``X (F + 1)^-1 y`` and P gains ``X (F + 1)^-1 X'``.
+    With y, F and X of these faults, the means lose ``X (F + 1 / s^2)^-1 y`` and P gains ``X (F + 1 / s^2)^-1 X'``.
 
     Parameters
     ----------
@@ -203,11 +209,12 @@ def freed(modes: Modes, full: Full, joint: Joint, faults: Bools) -> Full:
         The modes, and the exact filter.
     joint
         Joint scores of the onset after the same tick.
-    faults : (t,)
-        The members.
+    W : (t, f)
+        Columns of the faults in the modes.
+    std : (f,)
+        Prior standard deviations of their amounts.
     """
-    W = modes.U.T[:, faults]
     y, F = joint.of(W)
     X = np.vstack([modes.back @ joint.shift[0] @ W, modes.back @ joint.shift[1] @ W])
-    gain = np.linalg.solve(F + np.eye(y.size), X.T).T
+    gain = np.linalg.solve(F + np.diag(std**-2.0), X.T).T
     return replace(full, mean=full.mean - (gain @ y).reshape(2, -1), cov=full.cov + gain @ X.T)

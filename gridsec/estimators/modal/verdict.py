@@ -362,10 +362,10 @@ def _one_power(design: SequentialDesign, suspicion: Suspicion, one: Explanation)
     """Sentence about a single wrong power; empty where its amount is unknown."""
     found, customer = suspicion.found, int(np.flatnonzero(one.powers)[0])
     p = one.meters.size
-    for chosen, shock in zip(found.chosen, found.shock, strict=True):
+    for chosen, model in zip(found.chosen, found.model, strict=True):
         at = np.flatnonzero(chosen)
         if at.size == 1 and at[0] == p + customer:
-            mean, _ = amounts(found.problems[int(shock)], chosen)
+            mean, _ = amounts(found.problems[int(model)], chosen)
             # A missing injection lowers the voltages: the residual is that of the true power.
             return fault_sentence(design, customer, float(mean[0]))
     return ""
