@@ -341,10 +341,10 @@ class Support:
         y, F = now.of(W)
         problem = SearchProblem(y, F, np.full(k, 1.0), k, np.zeros(k), np.full(k, np.inf))
         every = np.ones((1, k), dtype=np.bool_)
-        one = Identification(every, ~every[:, 0], np.ones(1), every[0], (problem,))
+        one = Identification(every, np.zeros(1, np.intp), np.ones(1), every[0], (problem,))
         zero = np.zeros((plain.mean.size, k))
         T = estimate.moves(made, kernel.estimator, self.state, now, W, zero)
-        return estimate.corrected(plain, T, one)
+        return estimate.corrected([plain], [T], one)
 
 
 @dataclass

@@ -5,6 +5,7 @@
     step(core, state, t, m, seen) -> (CoreState, Evidence)      every tick, releases masked meters
     identify(core, state, evidence) -> Suspicion                where `alarmed`
     mask(core, state, suspicion) -> (CoreState, Evidence)       where meters are named
+    adopt(core, state, suspicion) -> CoreState                  where loads alone explain the readings
     estimate(core, state, suspicion) -> Estimated               where asked for
 
 The front end is that of `gridsec.estimators.sequential`: cleaning of frames, observer of the inverters,
@@ -20,7 +21,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid, Problem
-from gridsec.estimators.modal import detector, full, masking, replay, signatures, static
+from gridsec.estimators.modal import detector, full, masking, replay, rivals, signatures, static
 from gridsec.estimators.modal import estimate as estimates
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.detector import SIZE, Detector, Evidence
@@ -29,21 +30,22 @@ from gridsec.estimators.modal.filter import FilterState, Update
 from gridsec.estimators.modal.masking import Masked
 from gridsec.estimators.modal.model import Modes, ResidualModel, modes, residual_model
 from gridsec.estimators.modal.replay import History, Parts, Suspected
-from gridsec.estimators.modal.search import Identification, SearchProblem, cost, groups, search
+from gridsec.estimators.modal.rivals import Rival
+from gridsec.estimators.modal.search import DOUBT, Identification, SearchProblem, cost, groups, search
 from gridsec.estimators.modal.signatures import Columns, Joint
 from gridsec.estimators.modal.static import Static
 from gridsec.estimators.sequential.design import YEAR_S, SequentialDesign
 from gridsec.estimators.sequential.state import SequentialState
 from gridsec.grid.network import Power
 
-ACCUSATIONS = 5.0
+ACCUSATIONS = 1.0
 """Charge of a false power, in accusations of a meter: powers are promised to be within their limits."""
 FALSE_POWER = 0.05
 """Prior standard deviation of a false power, pu of the feeder's base: 5 kW at 100 kVA, a large appliance."""
 MOST_POWER = 3.0
 """Largest false power, in those that the customer can have, 1. False reports stay near the possible."""
-SHOCK = 10.0
-"""Variance of an unreported change of all loads, in those of the loads, 1: 2 kW where 0.6 kW is stated."""
+PRIOR = 0.5
+"""Prior probability that the loads' errors are as stated, 1; the rivals share the rest alike."""
 CONNECTION = 0.1
 """Power of a customer where the files are not asked, pu of the feeder's base: 10 kW at 100 kVA."""
 FARTHER = 5.0
@@ -74,6 +76,8 @@ class Core:
         Largest amount of each fault that is possible.
     limit
         Log gamma: the alarm is at log M >= limit.
+    rivals
+        Modes under other models of the loads.
     """
 
     model: ResidualModel
@@ -84,6 +88,7 @@ class Core:
     estimator: Estimator = field(repr=False)
     bound: Floats = field(repr=False)
     limit: float
+    rivals: tuple[Modes, ...] = field(repr=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,6 +107,8 @@ class CoreState:
         Exact scores of the pinned onsets, where the filter has a full covariance.
     masked
         Masked meters.
+    rivals
+        The model and its rivals since the start of the kept readings, with the likeliest of the pinned onsets.
     """
 
     filter: FilterState
@@ -111,6 +118,7 @@ class CoreState:
     history: History
     suspected: tuple[Suspected, ...]
     masked: Masked
+    rivals: tuple[Rival, ...] = ()
 
 
 def assemble(model: ResidualModel, powers: Floats, most: Floats, *, gamma: float) -> Core:
@@ -146,6 +154,7 @@ def assemble(model: ResidualModel, powers: Floats, most: Floats, *, gamma: float
         estimator=estimates.estimator(made),
         bound=np.concatenate([np.full(at.size, inf), MOST_POWER * most, np.full(int(used.sum()), inf)]),
         limit=log(gamma),
+        rivals=rivals.rivals(made),
     )
 
 
@@ -194,8 +203,13 @@ def init(core: Core, t: float) -> CoreState:
     return CoreState(*parts, None, History((*parts, ())), (), masking.none(made))
 
 
-def step(
-    core: Core, state: CoreState, t: float, m: Floats, seen: Bools | None = None
+def step(  # noqa: PLR0917  # the state, and one tick
+    core: Core,
+    state: CoreState,
+    t: float,
+    m: Floats,
+    seen: Bools | None = None,
+    unknown: Floats | None = None,
 ) -> tuple[CoreState, Evidence]:
     """Take in the residuals of one tick.
 
@@ -209,6 +223,9 @@ def step(
         Residuals, squared pu; any finite value where not seen.
     seen : (p,)
         Meters with a reading; None: all.
+    unknown : (p, k)
+        Directions of the residuals that are unknown at this tick, times their standard deviations; None for
+        none. The tick says nothing about them where the standard deviations are large.
 
     Raises
     ------
@@ -219,7 +236,9 @@ def step(
     if masked.meters.any():
         seen = ~masked.meters if read is None else read & ~masked.meters
     pinned = np.flatnonzero(state.detector.pinned).tolist()
-    after, known, update = full.step(made, state.filter, state.static, t, m, seen, stay=bool(pinned))
+    after, known, update = full.step(
+        made, state.filter, state.static, t, m, seen, stay=bool(pinned), unknown=unknown
+    )
     test, evidence = detector.step(
         made, core.faults, state.detector, update, known, h=h, alert=CALM * core.limit
     )
@@ -230,16 +249,18 @@ def step(
         if pinned and not suspected:
             suspected = replay.carried(made, state.detector.onsets, state.static, pinned)
         suspected = tuple(replay.follow(made, each, update.exact, h) for each in suspected)
+    others = tuple(rivals.follow(each, t, m, seen, unknown) for each in state.rivals)
     if evidence.log_m >= core.limit and (not pinned or (suspected and _elsewhere(evidence, pinned))):
         test = detector.pin(test, evidence.rows)
+        last = replay.record(state.history, (after, known, test, ()), m, seen, unknown)
+        others = rivals.replayed(made, core.rivals, last, test.onsets, int(evidence.rows[0]))
         if update.exact is not None:
-            last = replay.record(state.history, (after, known, test, ()), m, seen)
             rows = np.flatnonzero(test.pinned).tolist()
             suspected = replay.replayed(made, last, test.onsets, rows)
     elif pinned and evidence.log_m < CALM * core.limit:
-        test, suspected = detector.pin(test, evidence.rows[:0]), ()
-    history = replay.record(state.history, (after, known, test, suspected), m, seen)
-    return CoreState(after, known, test, update, history, suspected, masked), evidence
+        test, suspected, others = detector.pin(test, evidence.rows[:0]), (), ()
+    history = replay.record(state.history, (after, known, test, suspected), m, seen, unknown)
+    return CoreState(after, known, test, update, history, suspected, masked, others), evidence
 
 
 def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState, Evidence]:
@@ -261,16 +282,44 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
     if first < 0:
         begun = _joint(core, history.start, suspicion.row)
         whole = before.full or full.expanded(core.modes, before, known)
-        before = replace(before, full=replay.freed(core.modes, whole, begun, named))
+        W = core.faults.W[:, : named.size][:, named]
+        before = replace(before, full=replay.freed(core.modes, whole, begun, W, np.ones(W.shape[1])))
         test = detector.start(core.modes)
     test = detector.pin(test, np.zeros(0, np.intp))
     parts = before, known, test
     now = CoreState(*parts, None, History((*parts, ())), (), masking.none(core.modes))
     evidence = Evidence(-inf, np.full(test.capital.shape, -inf))
-    for k, (t, m, seen) in enumerate(history.readings):
+    for k, (t, m, seen, unknown) in enumerate(history.readings):
         read = seen if k < first else ~named if seen is None else seen & ~named
-        now, evidence = step(core, now, t, m, read)
+        now, evidence = step(core, now, t, m, read, unknown)
     return replace(now, masked=masking.added(state.masked, named)), evidence
+
+
+def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
+    """Go on with the likeliest model of the loads, where no explanation of weight needs a meter.
+
+    The filter becomes that of the rival, with the powers of the best explanation unknown since the onset. The
+    detector starts anew. The state is unchanged where meters are doubted.
+
+    Parameters
+    ----------
+    core, state
+        The core, and the state after a tick.
+    suspicion
+        The explanations after the same tick.
+    """
+    found, p = suspicion.found, core.modes.size
+    free = ~found.chosen[:, :p].any(axis=1)
+    if not free[0] or float(found.weight[~free].sum()) >= DOUBT or not state.rivals:
+        return state
+    rival = state.rivals[int(found.model[0])]
+    after, chosen = rival.filter, found.chosen[0]
+    if chosen.any():
+        whole = after.full or full.expanded(rival.modes, after, rival.static)
+        W, std = core.faults.W[:, chosen], found.problems[int(found.model[0])].std[chosen]
+        after = replace(after, full=replay.freed(rival.modes, whole, rival.joint(), W, std))
+    parts = after, rival.static, detector.start(core.modes)
+    return CoreState(*parts, rival.update, History((*parts, ())), (), state.masked)
 
 
 def _elsewhere(evidence: Evidence, pinned: list[int]) -> bool:
@@ -347,11 +396,15 @@ def _joint(core: Core, parts: Parts, row: int) -> Joint:
 
 
 def _searched(core: Core, state: CoreState, row: int) -> Identification:
-    """Explanations since one onset, with and without an unreported change of all loads."""
-    now = _joint(core, _parts(state), row)
-    other, ratio = signatures.shocked(core.modes, now, SHOCK)
-    charge = ACCUSATIONS * 2.0 * log(core.modes.size)
-    return search(_problem(core, now), core.groups, (_problem(core, other), charge - 2.0 * ratio))
+    """Explanations since one onset, under the model and under its rivals."""
+    model = _problem(core, _joint(core, _parts(state), row))
+    if not state.rivals:
+        return search(model, core.groups)
+    plain, others = state.rivals[0], state.rivals[1:]
+    less = 2.0 * log(PRIOR * len(others) / (1.0 - PRIOR))
+    costs = [2.0 * (plain.evidence - each.evidence) + less for each in others]
+    problems = [_problem(core, each.joint()) for each in others]
+    return search(model, core.groups, list(zip(problems, costs, strict=True)))
 
 
 def _problem(core: Core, joint: Joint) -> SearchProblem:
@@ -386,9 +439,12 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     plain = estimates.honest(made, by, state.filter, state.static, state.update)
     if suspicion is None:
         return plain
-    # A change of all loads is one more fault for each mode, with an effect on all places.
-    W = np.hstack([core.faults.W, np.eye(made.size)])
-    effect = np.hstack([core.effect, by.of_w])
     now = _joint(core, _parts(state), suspicion.row)
-    T = estimates.moves(made, by, state.filter, now, W, effect)
-    return estimates.corrected(plain, T, suspicion.found, (*now.of(W), np.sqrt(SHOCK * made.loads)))
+    before, T = [plain], [estimates.moves(made, by, state.filter, now, core.faults.W, core.effect)]
+    for each in state.rivals[1:]:
+        assert each.update is not None
+        before.append(
+            estimates.honest(each.modes, by, each.filter, each.static, each.update, loads=each.loads)
+        )
+        T.append(estimates.moves(each.modes, by, each.filter, each.joint(), core.faults.W, core.effect))
+    return estimates.corrected(before, T, suspicion.found)

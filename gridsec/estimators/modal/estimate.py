@@ -22,6 +22,7 @@ Särkkä, Bayesian Filtering and Smoothing, 2013, A.1 (Gaussian conditioning).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -29,7 +30,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, indices, submatrix
 from gridsec.estimators.modal.filter import FilterState, Full, Update
 from gridsec.estimators.modal.model import Modes
-from gridsec.estimators.modal.search import Identification
+from gridsec.estimators.modal.search import Identification, SearchProblem, amounts
 from gridsec.estimators.modal.signatures import Joint
 from gridsec.estimators.modal.static import Static
 
@@ -44,12 +45,15 @@ class Estimator:
         Regression of the error of the model at each place on w, b and e.
     rest : (n,)
         Variance that no reading takes away, squared pu^2.
+    rest_w : (n,)
+        Part of it that varies with the loads, squared pu^2.
     """
 
     of_w: Floats = field(repr=False)
     of_b: Floats = field(repr=False)
     of_e: Floats = field(repr=False)
     rest: Floats
+    rest_w: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,13 +87,21 @@ def estimator(modes: Modes) -> Estimator:
     by_b = np.linalg.solve(model.static(at), C.T).T if C.any() else np.zeros_like(C)
     by_e = model.flicker * (model.busbar_of @ (H.T @ modes.U))
     phases = (model.busbar_of**2).sum(axis=1)
-    rest = (1.0 - model.lasting) * (model.variance - (ratio * h).sum(axis=1))
-    rest += model.lasting * model.variance + model.busbar * phases - (by_b * C).sum(axis=1)
+    rest_w = (1.0 - model.lasting) * (model.variance - (ratio * h).sum(axis=1))
+    rest = rest_w + model.lasting * model.variance + model.busbar * phases - (by_b * C).sum(axis=1)
     rest += model.flicker * phases - (by_e * by_e).sum(axis=1)
-    return Estimator(ratio, by_b @ modes.back, by_e, np.maximum(rest, 0.0))
+    return Estimator(ratio, by_b @ modes.back, by_e, np.maximum(rest, 0.0), np.maximum(rest_w, 0.0))
 
 
-def honest(modes: Modes, made: Estimator, state: FilterState, static: Static, update: Update) -> Estimated:
+def honest(  # noqa: PLR0917  # the states of the parts
+    modes: Modes,
+    made: Estimator,
+    state: FilterState,
+    static: Static,
+    update: Update,
+    *,
+    loads: float = 1.0,
+) -> Estimated:
     """Estimate without a fault; O(n t).
 
     Parameters
@@ -98,14 +110,17 @@ def honest(modes: Modes, made: Estimator, state: FilterState, static: Static, up
         The modes, and the estimator of them.
     state, static, update
         The filter after the last tick, the information about the directions, and the filter's last step.
+    loads
+        Variance of the loads' errors that vary, in those of the model, 1.
     """
+    more = (loads - 1.0) * made.rest_w
     if state.full is not None:
-        return _full(modes, made, state.full, static.score)
+        return _full(modes, made, state.full, static.score, more)
     w, b = state.mean
     e = update.innovation / update.variance
     by_w, by_b = made.of_w - made.of_e, made.of_b - made.of_e
     variance = (by_w * by_w) @ state.cov[0] + (by_b * by_b) @ state.cov[2]
-    variance += 2.0 * ((by_w * by_b) @ state.cov[1]) + made.rest
+    variance += 2.0 * ((by_w * by_b) @ state.cov[1]) + made.rest + more
     mean = made.of_w @ w + made.of_b @ b + made.of_e @ e
     if modes.sign.size:
         moved = _theta(modes, made, static)
@@ -114,7 +129,7 @@ def honest(modes: Modes, made: Estimator, state: FilterState, static: Static, up
     return Estimated(mean, np.maximum(variance, 0.0))
 
 
-def _full(modes: Modes, made: Estimator, full: Full, score: Floats) -> Estimated:
+def _full(modes: Modes, made: Estimator, full: Full, score: Floats, more: Floats) -> Estimated:
     """Estimate by the full covariance: the flicker is seen by the members with a reading only."""
     model, by_e = modes.model, _flicker(modes, full)
     by_w, by_b = made.of_w @ modes.U.T, made.of_b @ modes.U.T
@@ -122,7 +137,7 @@ def _full(modes: Modes, made: Estimator, full: Full, score: Floats) -> Estimated
     read = ((by_e @ model.phases(modes.at)) * model.busbar_of).sum(axis=1)
     unread = (made.of_e**2).sum(axis=1) - model.flicker * read
     by = np.hstack([by_w - by_e, by_b - by_e])
-    return Estimated(mean, np.maximum(((by @ full.cov) * by).sum(axis=1) + made.rest + unread, 0.0))
+    return Estimated(mean, np.maximum(((by @ full.cov) * by).sum(axis=1) + made.rest + more + unread, 0.0))
 
 
 def _theta(modes: Modes, made: Estimator, static: Static) -> Floats:
@@ -166,26 +181,21 @@ def _flicker(modes: Modes, full: Full) -> Floats:
     return by_e
 
 
-def corrected(
-    before: Estimated, T: Floats, found: Identification, joint: tuple[Floats, Floats, Floats] | None = None
-) -> Estimated:
+def corrected(before: Sequence[Estimated], T: Sequence[Floats], found: Identification) -> Estimated:
     """Estimate mixed over the explanations.
 
     Parameters
     ----------
     before
-        The honest estimate.
-    T : (n, q + t)
-        From `moves`, of all faults of the problem, and of a change of the loads in each mode.
+        The honest estimate under each model of the loads.
+    T : (n, q) each
+        From `moves`, of all faults of the problem, under each model.
     found
         The explanations.
-    joint
-        Scores (q + t,) and information (q + t, q + t) of all of them, and the standard deviations of that
-        change (t,); None where no explanation has one.
     """
     each = [
-        _one(before, T, _problem_of(found, k, joint), _set_of(found, k, T.shape[1]))
-        for k in range(found.weight.size)
+        _one(before[model], T[model], found.problems[model], chosen)
+        for model, chosen in zip(found.model, found.chosen, strict=True)
     ]
     means = np.stack([one.mean for one in each])
     mean = found.weight @ means
@@ -193,31 +203,12 @@ def corrected(
     return Estimated(mean, spread)
 
 
-def _problem_of(
-    found: Identification, k: int, joint: tuple[Floats, Floats, Floats] | None
-) -> tuple[Floats, Floats, Floats]:
-    """Scores, information and prior standard deviations for one explanation."""
-    problem = found.problems[int(found.shock[k])]
-    if joint is None or not found.shock[k]:
-        return problem.y, problem.F, problem.std
-    y, F, std = joint
-    return y, F, np.concatenate([problem.std, std])
-
-
-def _set_of(found: Identification, k: int, size: int) -> Bools:
-    """Faults of one explanation among `size` of them: the chosen ones, and the loads where they changed."""
-    rest = np.full(size - found.chosen.shape[1], found.shock[k])
-    return np.concatenate([found.chosen[k], rest])
-
-
-def _one(before: Estimated, T: Floats, given: tuple[Floats, Floats, Floats], chosen: Bools) -> Estimated:
+def _one(before: Estimated, T: Floats, problem: SearchProblem, chosen: Bools) -> Estimated:
     """Estimate under one explanation."""
-    y, F, std = given
     at = np.flatnonzero(chosen)
-    at = at[std[at] > 0.0]
     if not at.size:
         return before
-    cov = np.linalg.inv(F[np.ix_(at, at)] + np.diag(std[at] ** -2.0))
+    mean, cov = amounts(problem, chosen)
     moved = T[:, at]
     more = np.einsum("xq,qr,xr->x", moved, cov, moved)
-    return Estimated(before.mean + moved @ (cov @ y[at]), before.variance + more)
+    return Estimated(before.mean + moved @ mean, before.variance + more)

@@ -258,6 +258,11 @@ class Modes:
     @cached_property
     def covariance_w(self) -> Floats:
         """Covariance of w at the members, (t, t)."""
+        return (self.back * self.varying) @ self.back.T
+
+    @cached_property
+    def jumps(self) -> Floats:
+        """Covariance ``(1 - c) S`` of a change of the loads at the members, (t, t)."""
         return (1.0 - self.model.lasting) * self.model.loads(self.at)
 
     @cached_property

@@ -33,7 +33,8 @@ from gridsec.estimators.modal.static import Static
 HALF = 64
 """Ticks from one kept state of the filter to the next; two of them cover the readings that are kept."""
 
-Reading = tuple[float, Floats, Bools | None]
+Reading = tuple[float, Floats, Bools | None, Floats | None]
+"""Time, residuals (t,), members with a reading (t,), and unknown directions (t, k) of a tick."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +77,7 @@ class History:
     start
         Filter, directions, detector and suspected onsets before the first reading.
     readings
-        Time, residuals and members with a reading of each tick, at most ``2 HALF``.
+        The ticks, at most ``2 HALF``.
     middle
         As ``start``, after the first `HALF` readings; None before.
     """
@@ -86,7 +87,9 @@ class History:
     middle: Parts | None = field(default=None, repr=False)
 
 
-def record(history: History, after: Parts, m: Floats, seen: Bools | None) -> History:
+def record(
+    history: History, after: Parts, m: Floats, seen: Bools | None, unknown: Floats | None = None
+) -> History:
     """Keep the readings of one tick.
 
     Parameters
@@ -97,8 +100,10 @@ def record(history: History, after: Parts, m: Floats, seen: Bools | None) -> His
         Filter, directions, detector and suspected onsets after the tick.
     m, seen : (t,)
         Residuals, and members with a reading.
+    unknown : (t, k)
+        Unknown directions.
     """
-    readings = (*history.readings, (after[0].t, m, seen))
+    readings = (*history.readings, (after[0].t, m, seen, unknown))
     if len(readings) == HALF:
         return replace(history, readings=readings, middle=after)
     if len(readings) == 2 * HALF and history.middle is not None:
@@ -118,10 +123,10 @@ def replayed(modes: Modes, history: History, onsets: Onsets, rows: Sequence[int]
     """
     count, (state, known, *_) = len(history.readings), history.start
     t, full = state.t, exact.expanded(modes, state, known) if state.full is None else state.full
-    out = {row: _begun(modes, row, bool(onsets.ramp[row])) for row in rows}
-    for k, (now, m, seen) in enumerate(history.readings):
+    out = {row: begun(modes, row, bool(onsets.ramp[row])) for row in rows}
+    for k, (now, m, seen, unknown) in enumerate(history.readings):
         h = now - t
-        full, innovation = exact.updated(modes, full, h, m, seen)
+        full, innovation = exact.updated(modes, full, h, m, seen, unknown)
         for row in rows:
             if onsets.age[row] >= count - k:
                 out[row] = follow(modes, out[row], innovation, h)
@@ -129,8 +134,14 @@ def replayed(modes: Modes, history: History, onsets: Onsets, rows: Sequence[int]
     return tuple(out.values())
 
 
-def _begun(modes: Modes, row: int, ramp: bool) -> Suspected:
-    """Scores before the onset."""
+def begun(modes: Modes, row: int, ramp: bool) -> Suspected:
+    """Scores before the onset.
+
+    Parameters
+    ----------
+    modes, row, ramp
+        The modes, the row of the onset and its shape.
+    """
     t = modes.size
     return Suspected(row, ramp, float(not ramp), np.zeros((2 * t, t)), np.zeros(t), np.zeros((t, t)))
 
@@ -187,10 +198,10 @@ def follow(modes: Modes, before: Suspected, innovation: Innovation, h: float) ->
     )
 
 
-def freed(modes: Modes, full: Full, joint: Joint, faults: Bools) -> Full:
-    """The exact filter with the amounts of the faults of some members unknown since the onset; O(t^2 f).
+def freed(modes: Modes, full: Full, joint: Joint, W: Floats, std: Floats) -> Full:
+    """The exact filter with the amounts of some faults unknown since the onset; O(t^2 f).
 
-    With y, F and X of these faults, the means lose ``X (F + 1)^-1 y`` and P gains ``X (F + 1)^-1 X'``.
+    With y, F and X of these faults, the means lose ``X (F + 1 / s^2)^-1 y`` and P gains ``X (F + 1 / s^2)^-1 X'``.
 
     Parameters
     ----------
@@ -198,11 +209,12 @@ def freed(modes: Modes, full: Full, joint: Joint, faults: Bools) -> Full:
         The modes, and the exact filter.
     joint
         Joint scores of the onset after the same tick.
-    faults : (t,)
-        The members.
+    W : (t, f)
+        Columns of the faults in the modes.
+    std : (f,)
+        Prior standard deviations of their amounts.
     """
-    W = modes.U.T[:, faults]
     y, F = joint.of(W)
     X = np.vstack([modes.back @ joint.shift[0] @ W, modes.back @ joint.shift[1] @ W])
-    gain = np.linalg.solve(F + np.eye(y.size), X.T).T
+    gain = np.linalg.solve(F + np.diag(std**-2.0), X.T).T
     return replace(full, mean=full.mean - (gain @ y).reshape(2, -1), cov=full.cov + gain @ X.T)

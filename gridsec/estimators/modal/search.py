@@ -34,14 +34,15 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from math import inf, log
 
 import numpy as np
 from scipy.cluster.hierarchy import linkage
-from scipy.linalg import blas, cho_solve, cholesky
+from scipy.linalg import blas, cho_solve, cholesky, lapack, solve_triangular
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, submatrix
 from gridsec.estimators.modal.model import Modes
 
 DOUBT = 1e-3
@@ -54,7 +55,9 @@ ALIKE = 0.99
 """Share of the variance of amounts that meters have in common where they are manipulated alike, 1."""
 SOME = 200
 """Number of sets that are also tried with amounts alike, the cheapest ones first."""
-FAR = 150.0
+HOPELESS = 60.0
+"""Cost above the best of all from which on a model of the loads is not explored further, 1."""
+FAR = 60.0
 """Cost above the best one, after one change, from which on a set without a meter is not followed, 1."""
 STEPS = 4
 """Largest number of steps of a descent, in meters: each may be added, removed and exchanged."""
@@ -116,18 +119,18 @@ class Identification:
     ----------
     chosen : (k, q)
         The sets.
-    shock : (k,)
-        Explanations in which all loads have changed at the onset as well.
+    model : (k,)
+        Number of the problem of each: 0, or that of a rival model of the loads.
     weight : (k,)
         Their posterior weights; they sum to 1.
     named : (p,)
         Meters without which nothing explains the readings.
     problems
-        The problem with the estimated prior size, and that with a change of all loads integrated out.
+        The problem with the estimated prior size, and those of the rivals.
     """
 
     chosen: Bools
-    shock: Bools
+    model: Ints
     weight: Floats
     named: Bools
     problems: tuple[SearchProblem, ...]
@@ -166,30 +169,69 @@ def cost(problem: SearchProblem, chosen: Bools) -> float:
     return out
 
 
-def alike(problem: SearchProblem, chosen: Bools) -> float:
-    """Cost of one set if its meters are off by nearly the same amount, as likely as if they are not; O(k^3).
+def alike(problem: SearchProblem, sets: Bools) -> Floats:
+    """Costs of some sets if their meters are off by nearly the same amount, (k,); O(n^3) each for n faults.
 
-    The amounts have the prior covariance ``s^2 (ALIKE 1 1' + (1 - ALIKE) I)``. The set bears the largest
+    The amounts have the prior covariance ``s^2 (ALIKE 1 1' + (1 - ALIKE) I)``. A set bears the largest
     charge besides: an unreported load moves neighbours alike as well.
 
     Parameters
     ----------
     problem
         The problem.
-    chosen : (q,)
-        The set.
+    sets : (k, q)
+        The sets.
     """
-    at = np.flatnonzero(chosen)
-    p, k = problem.meters, int(np.count_nonzero(chosen[: problem.meters]))
-    V = np.diag(problem.std[at] ** 2.0)
-    V[:k, :k] *= 1.0 - ALIKE
-    V[:k, :k] += ALIKE * np.outer(problem.std[at[:k]], problem.std[at[:k]])
-    half = np.linalg.cholesky(V)
-    y, inner = half.T @ problem.y[at], half.T @ problem.F[np.ix_(at, at)] @ half
-    inner[np.diag_indices(at.size)] += 1.0
-    lower = cholesky(inner, lower=True)
-    charge = float(penalties(p)[k] + problem.charge[at].sum() + problem.charge.max())
-    return charge - float(y @ cho_solve((lower, True), y)) + 2.0 * float(np.log(np.diag(lower)).sum())
+    p, (at, inside) = problem.meters, padded(sets)
+    std = np.where(inside, problem.std[at], 0.0)
+    common = np.where(at < p, std, 0.0)
+    own = np.where(at < p, np.sqrt(1.0 - ALIKE), 1.0) * std
+    # With the common amount as one more fault, the prior is diagonal.
+    F, y = problem.F[at[:, :, None], at[:, None, :]], problem.y[at]
+    side = np.einsum("kij,kj->ki", F, common)
+    n = at.shape[1]
+    A = np.empty((len(at), n + 1, n + 1))
+    A[:, :n, :n] = own[:, :, None] * F * own[:, None, :]
+    A[:, n, :n] = A[:, :n, n] = np.sqrt(ALIKE) * own * side
+    A[:, n, n] = ALIKE * np.einsum("ki,ki->k", common, side)
+    A[:, np.arange(n + 1), np.arange(n + 1)] += 1.0
+    pull = np.concatenate([own * y, np.sqrt(ALIKE) * (common * y).sum(axis=1)[:, None]], axis=1)
+    log_det, fit = _fits(A, pull)
+    counts = np.count_nonzero(sets[:, :p], axis=1)
+    charge = penalties(p)[counts] + sets @ problem.charge + problem.charge.max(initial=0.0)
+    return np.asarray(charge - fit + log_det)
+
+
+def padded(sets: Bools) -> tuple[Ints, Bools]:
+    """Members of sets, filled up to the same number, and where they are members, (k, n) each.
+
+    Parameters
+    ----------
+    sets : (k, q)
+        The sets.
+    """
+    count = np.count_nonzero(sets, axis=1)
+    inside = np.arange(int(count.max(initial=0))) < count[:, None]
+    at = np.zeros(inside.shape, dtype=np.intp)
+    at[inside] = np.nonzero(sets)[1]
+    return at, inside
+
+
+def _fits(A: Floats, v: Floats) -> tuple[Floats, Floats]:
+    """``log det A`` and ``v' A^-1 v`` of stacked positive definite matrices, (k,) each."""
+    # The last row of the Cholesky factor of [A, v; v', c] is (half^-1 v)', for any c that is large enough.
+    k, n = v.shape
+    bordered = np.empty((k, n + 1, n + 1))
+    bordered[:, :n, :n] = A
+    bordered[:, n, :n] = bordered[:, :n, n] = v
+    bordered[:, n, n] = _HUGE
+    half = np.linalg.cholesky(bordered)
+    white, diagonal = half[:, n, :n], np.einsum("kii->ki", half)[:, :n]
+    return 2.0 * np.log(diagonal).sum(axis=1), (white * white).sum(axis=1)
+
+
+_HUGE = 1e200
+"""Above all ``v' A^-1 v``."""
 
 
 def amounts(problem: SearchProblem, chosen: Bools) -> tuple[Floats, Floats]:
@@ -228,6 +270,31 @@ class Tableau:
         self.barred = np.zeros(q, dtype=np.bool_)
         self.cost = 0.0
         self.size = 2.0 * np.log(problem.std)
+
+    def pivot(self, chosen: Bools) -> Tableau:
+        """The same, pivoted on a set in place of none; O(q^2 k).
+
+        Parameters
+        ----------
+        chosen : (q,)
+            The set.
+        """
+        J, N = np.flatnonzero(chosen), np.flatnonzero(~np.append(chosen, False))
+        if not J.size:
+            return self
+        half, _ = lapack.dpotrf(submatrix(self.A, J, J), lower=True, clean=True)
+        white = solve_triangular(half, submatrix(self.A, J, N), lower=True, check_finite=False)
+        inverse, _ = lapack.dpotri(half, lower=True)
+        inverse = np.tril(inverse) + np.tril(inverse, -1).T
+        self.A[np.ix_(N, N)] -= white.T @ white
+        beside = solve_triangular(half, white, lower=True, trans=1, check_finite=False)
+        self.A[np.ix_(J, N)], self.A[np.ix_(N, J)] = beside, beside.T
+        self.A[np.ix_(J, J)] = -inverse
+        self.cost = 2.0 * float(np.log(half.diagonal()).sum()) - float(white[:, -1] @ white[:, -1])
+        self.cost += float(self.size[J].sum() + self.problem.charge[J].sum())
+        self.chosen = chosen.copy()
+        self.cost += float(self.penalty[self.count])
+        return self
 
     def copy(self) -> Tableau:
         """A tableau that can be changed without changing this one."""
@@ -305,22 +372,52 @@ class Tableau:
         self.chosen[j] = not self.chosen[j]
         self.cost += self.penalty[self.count] - self.penalty[k]
 
-    def group(self, members: Ints) -> float:
-        """Change of the cost by adding a group of meters, none of them chosen, O(g^3).
+    def group(self, members: Ints, inside: Bools) -> Floats:
+        """Change of the cost by adding groups of meters, (k,); inf where nothing or one meter is added.
 
         Parameters
         ----------
-        members : (g,)
-            The group.
+        members, inside : (k, g)
+            The groups, filled up to the same size, and where they are members. Chosen ones stay chosen.
         """
-        k, q = self.count, self.chosen.size
-        half, v = np.linalg.cholesky(self.A[np.ix_(members, members)]), self.A[members, q]
-        gain = np.linalg.solve(half, v)
-        more = 2.0 * np.log(half.diagonal()).sum() + self.size[members].sum() - gain @ gain
-        return float(more + self.penalty[k + members.size] - self.penalty[k])
+        q, p = self.chosen.size, self.problem.meters
+        free = inside & ~self.chosen[members]
+        count, k = np.count_nonzero(free, axis=1), self.count
+        A = np.where(
+            free[:, :, None] & free[:, None, :], self.A[members[:, :, None], members[:, None, :]], 0.0
+        )
+        A[:, np.arange(members.shape[1]), np.arange(members.shape[1])] += ~free
+        log_det, fit = _fits(A, np.where(free, self.A[members, q], 0.0))
+        size = (free * self.size[members]).sum(axis=1)
+        out = log_det + size - fit + self.penalty[np.minimum(k + count, p)] - self.penalty[k]
+        return np.where((count > 1) & ~(free & self.barred[members]).any(axis=1), out, inf)
 
 
-def descend(tableau: Tableau, groups: tuple[Ints, ...] = ()) -> Tableau:
+Groups = tuple[tuple[Ints, Bools], ...]
+"""Groups of meters as members and places in use, (k, g) each, those of similar sizes together."""
+
+
+def together(groups: Sequence[Ints]) -> Groups:
+    """Groups of similar sizes together.
+
+    Parameters
+    ----------
+    groups
+        Groups of meters.
+    """
+    out, sizes = [], np.array([each.size for each in groups])
+    class_of = np.ceil(np.log2(np.maximum(sizes, 1)))
+    for one in np.unique(class_of):
+        some = [groups[k] for k in np.flatnonzero(class_of == one)]
+        members = np.zeros((len(some), max(each.size for each in some)), dtype=np.intp)
+        inside = np.zeros(members.shape, dtype=np.bool_)
+        for k, each in enumerate(some):
+            members[k, : each.size], inside[k, : each.size] = each, True
+        out.append((members, inside))
+    return tuple(out)
+
+
+def descend(tableau: Tableau, groups: Groups = ()) -> Tableau:
     """Lower the cost by additions, removals, exchanges and groups until none of them helps.
 
     A fault with an amount that other changes have made impossible is removed and barred.
@@ -369,18 +466,17 @@ def _exchanged(tableau: Tableau) -> bool:
     return True
 
 
-def _grouped(tableau: Tableau, groups: tuple[Ints, ...]) -> bool:
+def _grouped(tableau: Tableau, groups: Groups) -> bool:
     """Add the rest of the best group, if one helps."""
     best, least = None, -_GAIN
-    for group in groups:
-        rest = group[~tableau.chosen[group]]
-        if rest.size > 1 and not tableau.barred[rest].any():
-            change = tableau.group(rest)
-            if change < least:
-                best, least = rest, change
+    for members, inside in groups:
+        change = tableau.group(members, inside)
+        k = int(change.argmin())
+        if change[k] < least:
+            best, least = members[k][inside[k]], float(change[k])
     if best is None:
         return False
-    for j in best:
+    for j in best[~tableau.chosen[best]]:
         tableau.toggle(int(j))
     return True
 
@@ -397,16 +493,22 @@ def relevant(problem: SearchProblem) -> Bools:
     F, y, alpha = problem.F[:p, :p], problem.y[:p], problem.std[:p] ** 2.0
     least = 1e-8 * alpha
     for _ in range(RELEVANCE):
-        cov = np.linalg.inv(F + np.diag(1.0 / alpha))
-        mean = cov @ y
-        alpha = np.maximum(mean * mean + cov.diagonal(), least)
+        A = F.copy()
+        A[np.diag_indices(p)] += 1.0 / alpha
+        half, _ = lapack.dpotrf(A, lower=True, overwrite_a=True)
+        mean = cho_solve((half, True), y, check_finite=False)
+        inverse, _ = lapack.dpotri(half, lower=True, overwrite_c=True)
+        variance = inverse.diagonal()
+        alpha = np.maximum(mean * mean + variance, least)
     out = np.zeros(problem.y.size, dtype=np.bool_)
-    out[:p] = mean * mean > STANDS_OUT * cov.diagonal()
+    out[:p] = mean * mean > STANDS_OUT * variance
     return out
 
 
 def search(
-    problem: SearchProblem, groups: tuple[Ints, ...] = (), shocked: tuple[SearchProblem, float] | None = None
+    problem: SearchProblem,
+    groups: tuple[Ints, ...] = (),
+    rivals: Sequence[tuple[SearchProblem, float]] = (),
 ) -> Identification:
     """Find the likeliest sets and the meters without which nothing explains the readings.
 
@@ -416,30 +518,44 @@ def search(
         The problem.
     groups
         Groups of neighbours, places of meters.
-    shocked
-        The problem with a change of all loads integrated out, and the cost of that change by itself.
+    rivals
+        The problem under other models of the loads, and the cost of each by itself.
     """
-    plain, found = _explored(problem, groups)
-    if shocked is None:
-        return _identified((plain,), (found,))
-    other, more = _explored(shocked[0], groups)
-    return _identified((plain, other), (found, {key: each + shocked[1] for key, each in more.items()}))
-
-
-def _explored(problem: SearchProblem, groups: tuple[Ints, ...]) -> tuple[SearchProblem, dict[bytes, float]]:
-    """The problem with the estimated prior size, and all sets that were met with their costs."""
+    batches = together(groups)
     start = relevant(problem)
-    best = _best((Tableau(problem), _at(problem, start)), groups)
-    sized = _sized(problem, best.chosen)
-    if sized is not problem:
-        problem, best = sized, _best((_at(sized, best.chosen), _at(sized, start)), groups)
-    found = {best.chosen.tobytes(): best.cost}
+    ends = [_descended(problem, (np.zeros_like(start), start), batches)]
+    for each, _ in rivals:
+        ends.append(_descended(each, (np.zeros_like(start), ends[0].chosen), batches))
+    costs = np.array([end.cost for end in ends]) + np.array([0.0, *(cost for _, cost in rivals)])
+    found = []
+    for end, cost in zip(ends, costs, strict=True):
+        near = cost < costs.min() + HOPELESS
+        sets = _explored(end, groups, batches) if near else {end.chosen.tobytes(): end.cost}
+        found.append({key: each + cost - end.cost for key, each in sets.items()})
+    return _identified(tuple(end.problem for end in ends), tuple(found))
+
+
+def _descended(problem: SearchProblem, starts: tuple[Bools, ...], groups: Groups) -> Tableau:
+    """The cheapest set from some starts, with the prior size that it has."""
+    best = _best(tuple(_at(problem, start) for start in starts), groups)
+    sizes = (_sized(problem, best.chosen), _sized(problem, starts[-1]))
+    ends = [
+        _best(tuple(_at(sized, start) for start in (best.chosen, starts[-1])), groups)
+        for sized in sizes
+        if sized is not problem
+    ]
+    return min(ends, key=lambda end: end.cost) if ends else best
+
+
+def _explored(best: Tableau, groups: tuple[Ints, ...], batches: Groups) -> dict[bytes, float]:
+    """All sets that were met from the best one on, with their costs."""
+    problem, found = best.problem, {best.chosen.tobytes(): best.cost}
 
     def keep(tableau: Tableau) -> None:
         found[tableau.chosen.tobytes()] = min(tableau.cost, found.get(tableau.chosen.tobytes(), inf))
 
     for tableau in _flipped(best, groups):
-        keep(descend(tableau, groups))
+        keep(descend(tableau, batches))
     top = min(found, key=lambda key: found[key])
     if top != best.chosen.tobytes():
         best = _at(problem, np.frombuffer(top, dtype=np.bool_))
@@ -448,34 +564,38 @@ def _explored(problem: SearchProblem, groups: tuple[Ints, ...]) -> tuple[SearchP
         # The best set of meters alone, which amounts alike may favour.
         only = Tableau(problem)
         only.barred[problem.meters :] = True
-        only = descend(only, groups)
+        only = descend(only, batches)
         keep(only)
         _neighbours(only, found)
     for j in np.flatnonzero(best.chosen[: problem.meters]):
         rival = best.copy()
         rival.bar(int(j))
         if rival.cost + min(0.0, float(rival.changes().min())) < best.cost + FAR:
-            keep(descend(rival, groups))
-    for key in sorted(found, key=lambda key: found[key])[:SOME]:
-        chosen = np.frombuffer(key, dtype=np.bool_)
-        if np.count_nonzero(chosen[: problem.meters]) > 1:
+            keep(descend(rival, batches))
+    _with_amounts_alike(problem, found)
+    return found
+
+
+def _with_amounts_alike(problem: SearchProblem, found: dict[bytes, float]) -> None:
+    """Mix both priors of the amounts in the cheapest sets with more than one meter."""
+    keys = sorted(found, key=lambda key: found[key])[:SOME]
+    sets = np.stack([np.frombuffer(key, dtype=np.bool_) for key in keys])
+    several = np.flatnonzero(np.count_nonzero(sets[:, : problem.meters], axis=1) > 1)
+    if several.size:
+        for k, other in zip(several, alike(problem, sets[several]), strict=True):
             # Twice the logarithm of the mean of both likelihoods.
-            both = np.logaddexp(-0.5 * found[key], -0.5 * alike(problem, chosen))
-            found[key] = 2.0 * (log(2.0) - float(both))
-    return problem, found
+            both = np.logaddexp(-0.5 * found[keys[k]], -0.5 * other)
+            found[keys[k]] = 2.0 * (log(2.0) - float(both))
 
 
-def _best(starts: tuple[Tableau, ...], groups: tuple[Ints, ...]) -> Tableau:
+def _best(starts: tuple[Tableau, ...], groups: Groups) -> Tableau:
     """The cheapest end of descents."""
     return min((descend(start, groups) for start in starts), key=lambda end: end.cost)
 
 
 def _at(problem: SearchProblem, chosen: Bools) -> Tableau:
     """A tableau pivoted on a set."""
-    out = Tableau(problem)
-    for j in np.flatnonzero(chosen):
-        out.toggle(int(j))
-    return out
+    return Tableau(problem).pivot(chosen)
 
 
 def _sized(problem: SearchProblem, chosen: Bools) -> SearchProblem:
@@ -537,8 +657,8 @@ def _identified(problems: tuple[SearchProblem, ...], found: tuple[dict[bytes, fl
     chosen = np.stack([np.frombuffer(key, dtype=np.bool_) for _, _, key in every])[kept]
     weight = weight[kept] / weight[kept].sum()
     without = weight @ ~chosen[:, : problems[0].meters]
-    shock = np.array([k > 0 for _, k, _ in every])[kept]
-    return Identification(chosen, shock, weight, np.asarray(without < DOUBT), problems)
+    model = np.array([k for _, k, _ in every])[kept]
+    return Identification(chosen, model, weight, np.asarray(without < DOUBT), problems)
 
 
 def groups(modes: Modes) -> tuple[Ints, ...]:

@@ -42,7 +42,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.estimators.modal.filter import Update
@@ -109,6 +108,28 @@ def empty(modes: Modes, steps: int, ramps: int = 0) -> Onsets:
         score=zero,
         information=zero,
         cross=zero,
+    )
+
+
+def single(onsets: Onsets, row: int) -> Onsets:
+    """One row by itself.
+
+    Parameters
+    ----------
+    onsets, row
+        The onsets, and the row.
+    """
+    at, read = slice(row, row + 1), onsets.read
+    return Onsets(
+        onsets.age[at],
+        onsets.used[at],
+        onsets.ramp[at],
+        onsets.level[at],
+        onsets.signature[:, at],
+        onsets.score[at],
+        onsets.information[at],
+        onsets.cross[at],
+        None if read is None else read[at],
     )
 
 
@@ -294,29 +315,6 @@ def joint(modes: Modes, onsets: Onsets, static: Static, row: int) -> Joint:
         shift[0] -= g_w @ turn
         shift[1] += (modes.directions - g_b) @ turn
     return Joint(score, information, shift, level)
-
-
-def shocked(modes: Modes, now: Joint, size: float) -> tuple[Joint, float]:
-    """Joint scores with a change of all loads ``N(0, size S)`` at the onset integrated out; O(t^3).
-
-    Also the logarithm of the likelihood ratio of such a change against none. With ``Q = size diag(lam)`` and
-    ``B = I + Q^(1/2) I Q^(1/2)``, the score loses ``I Q^(1/2) B^-1 Q^(1/2) y`` and the information
-    loses ``I Q^(1/2) B^-1 Q^(1/2) I``.
-
-    Parameters
-    ----------
-    modes, now
-        The modes, and the joint scores of one onset.
-    size
-        Variance of the change, in those of the loads.
-    """
-    root = np.sqrt(size * modes.loads)
-    side = root[:, None] * now.information
-    half = np.linalg.cholesky(np.eye(modes.size) + side * root)
-    lost = solve_triangular(half, np.column_stack([root * now.score, side]), lower=True)
-    ratio = 0.5 * float(lost[:, 0] @ lost[:, 0]) - float(np.log(np.diag(half)).sum())
-    score, information = now.score - lost[:, 1:].T @ lost[:, 0], now.information - lost[:, 1:].T @ lost[:, 1:]
-    return replace(now, score=score, information=information), ratio
 
 
 @dataclass(frozen=True, eq=False)

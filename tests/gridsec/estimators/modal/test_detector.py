@@ -106,30 +106,6 @@ def test_the_omnibus_equals_that_of_dense_filters(make: object) -> None:
     assert abs(detector.omnibus(now, s2)[0] - exact) <= 1e-8 * abs(exact)
 
 
-@pytest.mark.parametrize("make", [proportional, busbar, mixed])
-def test_a_change_of_all_loads_is_integrated_out(make: object) -> None:
-    """f ~ N(0, 10 S) beside one meter: both ratios against dense filters."""
-    assert callable(make)
-    model = make()
-    made, onset, size, std = modes(model), 15, 10.0, 0.01
-    readings = Source(model, np.random.default_rng(6)).ticks(40)
-    readings[onset:] += 0.002
-    state, more, rows = modal.start(made, 0.0), static.start(made), signatures.empty(made, 1)
-    for k, m in enumerate(readings):
-        state, more, update = full.step(made, state, more, float(k), m)
-        h = 1.0 if k else 0.0
-        rows = signatures.follow(made, rows, update, more, h, begun=[0] if k == onset else [])
-    now, ratio = signatures.shocked(made, signatures.joint(made, rows, more, 0), size)
-    loads = root(model.loads(made.at)) * sqrt(size) / std
-    exact = exact_ratio(model, readings, loads, std, onset, False)
-    assert abs(ratio - exact) <= 1e-7 * abs(exact)
-    of = signatures.columns(made, np.zeros((12, 0)), np.zeros(0), std)
-    y, F = now.of(of.W[:, :12])
-    found = detector.log_lambda(y, np.diag(F), np.full(12, std**2))
-    both = exact_ratio(model, readings, np.hstack([loads, np.eye(12)[:, [4]]]), std, onset, False)
-    assert abs(ratio + found[4] - both) <= 1e-7 * abs(both)
-
-
 @pytest.mark.canary("random-busbar")
 @pytest.mark.parametrize("make", [proportional, busbar, mixed])
 @pytest.mark.parametrize("kind", ["outage", "half", "random", "alternating"])

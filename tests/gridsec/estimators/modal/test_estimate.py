@@ -87,9 +87,9 @@ def test_equals_the_joint_gaussian(lasting: float, fault: str) -> None:
         problem = SearchProblem(y, F, np.array([std]), 1, np.zeros(1), np.full(1, np.inf))
         T = estimate.moves(made, prepared, state, now, W, effect)
         one = Identification(
-            np.ones((1, 1), bool), np.zeros(1, bool), np.ones(1), np.ones(1, bool), (problem,)
+            np.ones((1, 1), bool), np.zeros(1, np.intp), np.ones(1), np.ones(1, bool), (problem,)
         )
-        found = estimate.corrected(found, T, one)
+        found = estimate.corrected([found], [T], one)
         assert amounts(problem, np.ones(1, bool))[0].shape == (1,)
     mean, variance = joint(model, m, G, effect, onset, std if fault != "none" else 0.0)
     if made.sign.size <= static.FEW:
@@ -102,9 +102,9 @@ def test_a_mixture_contains_the_disagreement() -> None:
     F = np.diag([100.0, 100.0])
     problem = SearchProblem(np.array([50.0, 50.0]), F, np.ones(2), 2, np.zeros(2), np.full(2, np.inf))
     chosen = np.array([[True, False], [False, True]])
-    found = Identification(chosen, np.zeros(2, bool), np.array([0.5, 0.5]), np.zeros(2, bool), (problem,))
+    found = Identification(chosen, np.zeros(2, np.intp), np.array([0.5, 0.5]), np.zeros(2, bool), (problem,))
     before = estimate.Estimated(np.zeros(1), np.array([1e-4]))
-    after = estimate.corrected(before, np.array([[1.0, -1.0]]), found)
+    after = estimate.corrected([before], [np.array([[1.0, -1.0]])], found)
     f, own = 50.0 / 101.0, 1.0 / 101.0
     assert np.allclose(after.mean, 0.0)
     assert np.allclose(after.variance, 1e-4 + own + f**2)

@@ -1,0 +1,287 @@
+"""Rival models of the loads: changes that no report shows, as jumps at some ticks and as unrest.
+
+The filter of `gridsec.estimators.modal.filter` takes the loads' errors as a stationary AR(1). Kettles and cars
+that no report shows, powers that are old and powers that are unread make them jump. A rival is the same filter
+since the start of the kept readings, with other errors of the loads:
+
+    w_t = rho w_(t-1) + u_t,   cov u_t = (1 - rho^2) UNREST (1 - c) S + j_t (1 - c) S
+
+with a jump j_t of 0 or of one of `JUMPS` at each tick. The jumps are hypotheses with the prior `RATE` per tick.
+At each tick the likelier one is taken, given the ticks before: for these jumps the filter is exact. With
+
+    evidence = log prior of the jumps + sum_t log N(nu_t; 0, V_t)
+
+two models of the loads are compared, for each set of faults: a set has the weight of its cost under the model
+times the evidence. Under a rival a fault counts only as far as no loads imitate it.
+
+With constant amounts theta of the directions, ``nu_t`` and ``V_t`` of a mode are those without theta, and the
+evidence has the term ``(theta' N^-1 theta - log det N^-1) / 2``, that at the start subtracted.
+
+References
+----------
+Ghahramani and Hinton, Variational learning for switching state-space models, Neural Computation 12, 2000.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from math import exp, log
+
+import numpy as np
+from scipy.linalg import lapack
+
+from gridsec.arrays import Bools, Floats, all_of, indices, submatrix
+from gridsec.estimators.modal import full as exact
+from gridsec.estimators.modal import filter as modal
+from gridsec.estimators.modal import replay, signatures
+from gridsec.estimators.modal.filter import FilterState, Update
+from gridsec.estimators.modal.model import Modes
+from gridsec.estimators.modal.replay import History, Suspected
+from gridsec.estimators.modal.signatures import Joint, Onsets
+from gridsec.estimators.modal.static import Static
+
+UNREST = (1.0, 30.0)
+"""Variances of the loads' changes of the rivals, in those of the model, 1."""
+JUMPS = (10.0, 100.0)
+"""Variances of a jump of all loads, in those of the loads, 1: 2 and 6 kW where 0.6 kW is stated."""
+RATE = 1.0 / 60.0
+"""Prior probability of a jump of each size, per tick: kettles and cars of a street."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rival:
+    """One model of the loads since the start of the kept readings, and the scores of one onset under it.
+
+    Attributes
+    ----------
+    modes
+        The modes, with the variance of the loads' changes.
+    filter, static
+        States of the parts.
+    sum
+        Logarithm of the prior of the jumps and of the likelihood of the readings, without a fault and, while
+        the filter is modal, without theta.
+    known
+        Part of theta in the evidence that is subtracted: that before the first reading.
+    onsets, suspected
+        The onset, in row 0, in the modes, and its exact scores where readings have been missing.
+    jumps
+        Number of jumps; None where the loads never jump.
+    update
+        The filter's last step.
+    loads
+        Variance of the loads' errors that vary, without any reading, in those of the model, 1.
+    """
+
+    modes: Modes
+    filter: FilterState
+    static: Static
+    sum: float
+    known: float
+    onsets: Onsets
+    suspected: Suspected | None
+    jumps: int | None
+    update: Update | None = None
+    loads: float = 1.0
+
+    @property
+    def unrest(self) -> float:
+        """Variance of the loads' changes, in those of the model."""
+        at = int(self.modes.loads.argmax())
+        return float(self.modes.varying[at] / ((1.0 - self.modes.model.lasting) * self.modes.loads[at]))
+
+    @property
+    def evidence(self) -> float:
+        """Logarithm of the prior of the jumps and of the likelihood of the readings, without a fault."""
+        return self.sum + (
+            0.0 if self.filter.full is not None else _of_theta(self.modes, self.static) - self.known
+        )
+
+    def joint(self) -> Joint:
+        """Joint scores of the onset."""
+        if self.suspected is not None:
+            return self.suspected.joint(self.modes)
+        return signatures.joint(self.modes, self.onsets, self.static, 0)
+
+
+def rivals(modes: Modes) -> tuple[Modes, ...]:
+    """The modes under each of `UNREST`.
+
+    Parameters
+    ----------
+    modes
+        The modes of the model.
+    """
+    return tuple(replace(modes, varying=scale * modes.varying) for scale in UNREST)
+
+
+def first(modes: Modes, others: Sequence[Modes], history: History) -> list[Rival]:
+    """The model itself, without jumps, and all rivals, before the first kept reading and without an onset.
+
+    Parameters
+    ----------
+    modes, others
+        The modes, and those of the rivals.
+    history
+        The readings.
+    """
+    state, known, *_ = history.start
+    none = signatures.empty(modes, 1)
+    return [
+        Rival(each, state, known, 0.0, _of_theta(each, known), none, None, 0 if k else None)
+        for k, each in enumerate((modes, *others))
+    ]
+
+
+def replayed(
+    modes: Modes, others: Sequence[Modes], history: History, onsets: Onsets, row: int
+) -> tuple[Rival, ...]:
+    """The model itself, without jumps, and all rivals, after the last reading.
+
+    Parameters
+    ----------
+    modes, others
+        The modes, and those of the rivals.
+    history
+        The readings.
+    onsets, row
+        The onsets of the detector after the last reading, and the row of the onset.
+    """
+    state, _, test, suspected = history.start
+    count, age, had = len(history.readings), int(onsets.age[row]), test.onsets
+    older = bool(had.used[row]) and int(had.age[row]) == age - count
+    exactly = next((each for each in suspected if older and each.row == row), None)
+    begin = max(0, count - age)
+    one = signatures.empty(modes, int(not onsets.ramp[row]), int(onsets.ramp[row]))
+    if older and (state.full is None or exactly is not None):
+        begin, one = -1, signatures.single(had, row)
+    out = [replace(each, onsets=one, suspected=exactly) for each in first(modes, others, history)]
+    for k, (t, m, seen, unknown) in enumerate(history.readings):
+        out = [follow(each, t, m, seen, unknown, begun=k == begin) for each in out]
+    return tuple(out)
+
+
+def follow(  # noqa: PLR0917  # the rival, and one tick
+    before: Rival,
+    t: float,
+    m: Floats,
+    seen: Bools | None,
+    unknown: Floats | None = None,
+    *,
+    begun: bool = False,
+) -> Rival:
+    """Take in the residuals of one tick.
+
+    Parameters
+    ----------
+    before
+        The rival so far.
+    t
+        Time, s.
+    m, seen : (p,)
+        Residuals, and members with a reading; None: all.
+    unknown : (p, k)
+        Unknown directions, as in `gridsec.estimators.modal.full.step`.
+    begun
+        The onset is at this tick.
+    """
+    modes, state, known, h = before.modes, before.filter, before.static, t - before.filter.t
+    total, onsets, suspected, jumps = before.sum, before.onsets, before.suspected, before.jumps
+    if state.full is None and not ((seen is None or all_of(seen)) and unknown is None):
+        total += _of_theta(modes, known) - before.known
+        if onsets.used[0]:
+            (suspected,) = replay.carried(modes, onsets, known, [0])
+        state = replace(state, full=exact.expanded(modes, state, known))
+    size = 0.0
+    if jumps is not None:
+        size, prior = _jump(modes, state, known, h, m, seen, unknown)
+        total, jumps = total + prior, jumps + (size > 0.0)
+        state = _jumped(modes, state, h, size)
+    state, known, update = exact.step(modes, state, known, t, m, seen, stay=True, unknown=unknown)
+    if update.exact is None:
+        total -= 0.5 * float((update.innovation**2 / update.variance + np.log(update.variance)).sum())
+        onsets = signatures.follow(modes, onsets, update, known, h, begun=[0] if begun else [])
+    else:
+        half, white = update.exact.half, update.exact.white
+        total -= 0.5 * float(white @ white) + float(np.log(half.diagonal()).sum())
+        if begun:
+            suspected = replay.begun(modes, 0, bool(onsets.ramp[0]))
+        if suspected is not None:
+            suspected = replay.follow(modes, suspected, update.exact, h)
+    rho2 = exp(-2.0 * h / modes.model.time_s)
+    loads = rho2 * before.loads + (1.0 - rho2) * before.unrest + size
+    return replace(
+        before,
+        filter=state,
+        static=known,
+        sum=total,
+        onsets=onsets,
+        suspected=suspected,
+        jumps=jumps,
+        update=update,
+        loads=loads,
+    )
+
+
+def _of_theta(modes: Modes, known: Static) -> float:
+    """``(theta' N^-1 theta - log |det N^-1|) / 2``."""
+    if not modes.sign.size:
+        return 0.0
+    G = modes.directions
+    precision = np.diag(modes.sign) + (G.T * known.information) @ G
+    return 0.5 * float(known.pull @ np.linalg.solve(precision, known.pull) - np.linalg.slogdet(precision)[1])
+
+
+def _jump(  # noqa: PLR0917  # the states of both parts, and one tick
+    modes: Modes,
+    state: FilterState,
+    known: Static,
+    h: float,
+    m: Floats,
+    seen: Bools | None,
+    unknown: Floats | None,
+) -> tuple[float, float]:
+    """The likeliest jump of a tick, in the variances of the loads, and the logarithm of its prior."""
+    rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
+    sizes, priors = (0.0, *JUMPS), [log(1.0 - len(JUMPS) * RATE), *[log(RATE)] * len(JUMPS)]
+    varying = (1.0 - modes.model.lasting) * modes.loads
+    if state.full is None:
+        _, _, v = modal.predicted(modes, state.cov, rho, rho_b)
+        g = known.signature
+        nu = m @ modes.U - rho * state.mean[0] - rho_b * state.mean[1]
+        if modes.sign.size:
+            nu -= (1.0 - rho * g[0] - rho_b * g[1]) * (modes.directions @ known.theta)
+        each = [
+            prior - 0.5 * float((nu**2 / w + np.log(w)).sum())
+            for prior, w in ((q, v + size * varying) for q, size in zip(priors, sizes, strict=True))
+        ]
+    else:
+        n = np.arange(modes.size) if seen is None else indices(seen)
+        if not n.size:
+            return 0.0, priors[0]
+        nu = (m - rho * state.full.mean[0] - rho_b * state.full.mean[1])[n]
+        V, S = exact.expected(modes, state.full, h, n), submatrix(modes.jumps, n, n)
+        if unknown is not None:
+            V = V + unknown[n] @ unknown[n].T
+        each = []
+        for prior, size in zip(priors, sizes, strict=True):
+            half, _ = lapack.dpotrf(V + size * S, lower=True, clean=True)
+            white, _ = lapack.dtrtrs(half, nu, lower=True)
+            each.append(prior - 0.5 * float(white @ white) - float(np.log(half.diagonal()).sum()))
+    best = int(np.argmax(each))
+    return sizes[best], priors[best]
+
+
+def _jumped(modes: Modes, state: FilterState, h: float, size: float) -> FilterState:
+    """State before a tick at which the loads jump."""
+    if not size:
+        return state
+    more = size * exp(2.0 * h / modes.model.time_s)
+    cov, full = state.cov.copy(), state.full
+    cov[0] += more * (1.0 - modes.model.lasting) * modes.loads
+    if full is not None:
+        t, P = modes.size, full.cov.copy()
+        P[:t, :t] += more * modes.jumps
+        full = replace(full, cov=P)
+    return replace(state, cov=cov, full=full)

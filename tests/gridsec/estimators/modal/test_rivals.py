@@ -1,0 +1,104 @@
+"""Rival models of the loads against dense filters, and loads that jump without a report."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks._residuals import Dense, Source, power_columns, tree
+from gridsec.estimators.modal import core, rivals, signatures
+from gridsec.estimators.modal.rivals import RATE, UNREST
+from tests.gridsec.estimators.modal.test_core import LIAR, MODEL
+from tests.gridsec.estimators.modal.test_detector import busbar
+from tests.gridsec.estimators.modal.test_filter import masks, mixed, proportional
+
+STEPS = power_columns(tree(12, np.random.default_rng(3)))[:, :12]
+"""Effect of active powers on the residuals of `MODEL`."""
+
+
+@pytest.mark.parametrize("make", [proportional, busbar, mixed])
+@pytest.mark.parametrize("kind", ["complete", "random"])
+@pytest.mark.parametrize("unrest", range(len(UNREST)))
+def test_evidence_and_scores_equal_those_of_the_dense_filter(make: object, kind: str, unrest: int) -> None:
+    """Jumps as the rival found them: likelihood of all readings, and posterior of faults in all members."""
+    assert callable(make)
+    model, onset, ticks, p = make(), 22, 40, 12
+    kernel = core.assemble(model, np.zeros((13, 12)), np.ones(12), gamma=1e6)
+    made = kernel.rivals[unrest]
+    seen = np.ones((ticks, p), dtype=np.bool_)
+    if kind == "random":
+        seen[15:] = masks(kind, p, ticks)[15:]
+    readings = Source(model, np.random.default_rng(5)).ticks(ticks)
+    readings[onset:] += 8.0 * np.sqrt(model.loads(np.arange(p)).diagonal())
+    mine = rivals.first(kernel.modes, kernel.rivals, core.init(kernel, 0.0).history)[1 + unrest]
+    dense, without = Dense(model, np.eye(p), 1.0), Dense(model)
+    for each in (dense, without):
+        each.prior[:p, :p] *= UNREST[unrest]
+    rho = np.exp(-1.0 / model.time_s)
+    exact = 0.0
+    for k in range(ticks):
+        before = mine
+        mine = rivals.follow(mine, float(k), readings[k], seen[k], begun=k == onset)
+        rho2 = rho**2 if k else 1.0
+        size = mine.loads - rho2 * before.loads - (1.0 - rho2) * UNREST[unrest]
+        for each in (dense, without):
+            each.cov[:p, :p] += size / rho2 * (1.0 - model.lasting) * model.loads(np.arange(p))
+            nu, V = each.step(1.0 if k else 0.0, readings[k], seen[k], level=float(k >= onset))
+        jumped = mine.jumps != before.jumps
+        exact += np.log(RATE if jumped else 1.0 - 2.0 * RATE)
+        exact -= 0.5 * float(nu @ np.linalg.solve(V, nu) + np.linalg.slogdet(V)[1])
+        if before.filter.full is None and seen[k].all():
+            exact -= float(np.linalg.slogdet(made.U)[1])
+    assert mine.jumps
+    first = rivals.first(kernel.modes, kernel.rivals, core.init(kernel, 0.0).history)[1 + unrest]
+    start = 0.5 * float(np.linalg.slogdet(np.diag(made.sign))[1]) if made.sign.size else 0.0
+    assert first.evidence == 0.0
+    assert mine.evidence == pytest.approx(exact + start, abs=1e-5)
+    cov, now = dense.cov[3 * p :, 3 * p :], mine.joint()
+    information, score = made.U @ now.information @ made.U.T, made.U @ now.score
+    assert np.allclose(np.linalg.inv(cov), np.eye(p) + information, rtol=1e-5, atol=1e-3)
+    assert np.allclose(cov @ score, dense.mean[3 * p :], atol=1e-7 * np.abs(dense.mean[3 * p :]).max())
+
+
+def test_the_first_of_the_rivals_is_the_model() -> None:
+    """Its scores are those of the detector, also for an onset before the kept readings."""
+    kernel = core.assemble(MODEL, STEPS_OF_PLACES, np.full(12, 0.1), gamma=1e6)
+    source, state = Source(MODEL, np.random.default_rng(1)), core.init(kernel, 0.0)
+    for k in range(500):
+        lie = 0.001 * (k >= 200) * np.eye(12)[LIAR]
+        state, evidence = core.step(kernel, state, float(k), source.tick() + lie)
+    row = int(evidence.rows[0])
+    mine = rivals.replayed(kernel.modes, kernel.rivals, state.history, state.detector.onsets, row)[0]
+    other = signatures.joint(kernel.modes, state.detector.onsets, state.static, row)
+    now = mine.joint()
+    assert np.allclose(now.score, other.score, atol=1e-8 * np.abs(other.score).max())
+    assert np.allclose(now.information, other.information, atol=1e-8 * np.abs(other.information).max())
+
+
+STEPS_OF_PLACES = np.vstack([np.zeros((1, 12)), STEPS])
+
+
+@pytest.mark.parametrize("kind", ["complete", "random"])
+@pytest.mark.parametrize("liar", [False, True])
+def test_loads_that_jump_accuse_no_honest_meter(kind: str, liar: bool) -> None:
+    """Five cars of 11 kW, each for a minute: none is named but a meter that is off by 2 %."""
+    kernel = core.assemble(MODEL, STEPS_OF_PLACES, np.full(12, 0.1), gamma=1e6)
+    source, random = Source(MODEL, np.random.default_rng(1)), np.random.default_rng(2)
+    state, jumps, named = core.init(kernel, 0.0), np.zeros((260, 12)), np.zeros(12, dtype=np.bool_)
+    for j in random.permutation(12)[:5]:
+        begin = int(random.integers(150, 200))
+        jumps[begin : begin + 60, j] = -0.11
+    seen = np.ones((260, 12), dtype=np.bool_)
+    if kind == "random":
+        seen[100:] = random.random((160, 12)) > 0.2
+    alarms = 0
+    for k in range(260):
+        m = source.tick() + STEPS @ jumps[k] + 0.04 * (liar and k >= 130) * np.eye(12)[LIAR]
+        state, evidence = core.step(kernel, state, float(k), m, seen[k])
+        if core.alarmed(kernel, evidence) and k % 8 == 7:
+            alarms += 1
+            suspicion = core.identify(kernel, state, evidence)
+            named, state = suspicion.found.named, core.adopt(kernel, state, suspicion)
+            assert not named[np.arange(12) != LIAR].any()
+    assert alarms
+    assert named[LIAR] == liar
