@@ -57,6 +57,8 @@ SOME = 200
 """Number of sets that are also tried with amounts alike, the cheapest ones first."""
 HOPELESS = 60.0
 """Cost above the best of all from which on a model of the loads is not explored further, 1."""
+NEAR, EXPANDED = 10.0, 8
+"""Cost above the best one up to which the sets beside a set are looked at as well, and their number."""
 FAR = 60.0
 """Cost above the best one, after one change, from which on a set without a meter is not followed, 1."""
 STEPS = 4
@@ -567,6 +569,10 @@ def _explored(best: Tableau, groups: tuple[Ints, ...], batches: Groups) -> dict[
         rival.bar(int(j))
         if rival.cost + min(0.0, float(rival.changes().min())) < best.cost + FAR:
             keep(descend(rival, batches))
+    likely = sorted((each, key) for key, each in found.items() if each < best.cost + NEAR)
+    for _, key in likely[: EXPANDED + 1]:
+        if key != best.chosen.tobytes():
+            _neighbours(_at(problem, np.frombuffer(key, dtype=np.bool_)), found)
     _with_amounts_alike(problem, found)
     return found
 
@@ -626,7 +632,7 @@ _FLIPS = 4
 
 def _neighbours(best: Tableau, found: dict[bytes, float]) -> None:
     """Add the sets that differ from the best by one addition, removal or exchange, if they weigh anything."""
-    limit = best.cost - 2.0 * log(BELIEVED)
+    limit = min(found.values()) - 2.0 * log(BELIEVED)
     change = best.changes()
     for j in np.flatnonzero(best.cost + change < limit):
         chosen = best.chosen.copy()

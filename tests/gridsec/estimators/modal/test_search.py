@@ -94,7 +94,7 @@ def test_costs_changes_and_exchanges_are_exact(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("liars", [0, 1, 2, 3])
 def test_the_best_set_is_that_of_brute_force(seed: int, liars: int) -> None:
-    """Ten faults, all 1024 subsets: the cheapest one is found, and with it at least 70 % of the weight."""
+    """Ten faults, all 1024 subsets: the cheapest one is found, and with it at least 95 % of the weight."""
     given = problem(seed, liars=liars)
     found = s.search(given)
     sets = every(found.problems[0])
@@ -104,7 +104,7 @@ def test_the_best_set_is_that_of_brute_force(seed: int, liars: int) -> None:
     weight /= weight.sum()
     kept = {each.tobytes(): w for each, w in zip(found.chosen, found.weight, strict=True)}
     missed = sum(w for w, (_, chosen) in zip(weight, sets, strict=True) if chosen.tobytes() not in kept)
-    assert missed < 0.3
+    assert missed < 0.05
     without = np.array(
         [weight @ np.array([not chosen[j] for _, chosen in sets]) for j in range(given.meters)]
     )
