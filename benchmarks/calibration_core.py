@@ -24,6 +24,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import sys
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -57,7 +58,7 @@ def kernel_of(number: int) -> tuple[Core, Floats]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Look:
-    """One look at an alarm: weights, the meters of the likeliest explanation, the named and the manipulated."""
+    """One look at an alarm: weights, meters of the likeliest explanation, named and manipulated meters."""
 
     weight: float
     likeliest: Bools
@@ -106,7 +107,7 @@ def run(seed: int) -> Look | None:
 def table(weight: Floats, right: Bools, what: str) -> None:
     """One table."""
     print(f"\n| weight | {what} | mean weight, % | right, % |\n|---|---|---|---|")
-    for low, high in zip(EDGES[:-1], EDGES[1:], strict=True):
+    for low, high in pairwise(EDGES):
         inside = (weight >= low) & (weight < high)
         if inside.any():
             text = f"{100 * weight[inside].mean():.1f} | {100 * right[inside].mean():.1f}"
@@ -118,7 +119,11 @@ def main(runs: int, seed: int) -> int:
     looks = [look for look in map(run, range(seed, seed + runs)) if look is not None]
     right = np.array([bool((each.likeliest == each.liars).all()) for each in looks])
     table(np.array([each.weight for each in looks]), right, "looks")
-    table(np.concatenate([each.marginal for each in looks]), np.concatenate([each.liars for each in looks]), "meters")
+    table(
+        np.concatenate([each.marginal for each in looks]),
+        np.concatenate([each.liars for each in looks]),
+        "meters",
+    )
     named = sum(bool(each.named.any()) for each in looks)
     honest = sum(bool((each.named & ~each.liars).any()) for each in looks)
     print(f"\n{len(looks)} looks of {runs} runs; a meter is named in {named}, an honest one in {honest}")

@@ -386,7 +386,8 @@ class Tableau:
         q, p = self.chosen.size, self.problem.meters
         free = inside & ~self.chosen[members]
         count, k = np.count_nonzero(free, axis=1), self.count
-        A = np.where(free[:, :, None] & free[:, None, :], self.A[members[:, :, None], members[:, None, :]], 0.0)
+        both = free[:, :, None] & free[:, None, :]
+        A = np.where(both, self.A[members[:, :, None], members[:, None, :]], 0.0)
         A[:, np.arange(members.shape[1]), np.arange(members.shape[1])] += ~free
         log_det, fit = _fits(A, np.where(free, self.A[members, q], 0.0))
         size = (free * self.size[members]).sum(axis=1)
