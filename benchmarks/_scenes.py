@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -23,7 +24,7 @@ from feeders.simulation.scenario import START, Scenario
 from feeders.simulation.trial import FrameTruth, LoadError, Trial, TrialMeterErrors, frames
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Attack
-from gridsec.estimators.sequential import SequentialDesign, SequentialState, init, step
+from gridsec.estimators.sequential import Commission, SequentialDesign, SequentialState, init, step
 from gridsec.estimators.sequential.meter_bias import Learned
 from gridsec.interface import Frame, PowerOrigin
 
@@ -98,12 +99,17 @@ def _trial(feeder: str, model: Model, step_s: float) -> tuple[Trial, Site]:
 
 @lru_cache(maxsize=32)
 def watcher(
-    feeder: str, model: Model, *, step_s: float = 1.0, commission_s: float = 0.0
+    feeder: str,
+    model: Model,
+    *,
+    step_s: float = 1.0,
+    commission_s: float = 0.0,
+    estimator: str = SEQUENTIAL,
 ) -> DesignedEstimator:
-    """The default monitor of a feeder."""
+    """The monitor of a feeder, by default the default one."""
     _, stated = _trial(feeder, model, step_s)
     meta = stated.tables.meta
-    settings = replace(meta.monitor, estimator=SEQUENTIAL, commission_s=commission_s)
+    settings = replace(meta.monitor, estimator=estimator, commission_s=commission_s)
     return design(from_tables(replace(stated.tables, meta=replace(meta, monitor=settings))))
 
 
@@ -182,6 +188,34 @@ def start(setting: Setting) -> tuple[SequentialDesign, SequentialState]:
     made: SequentialDesign = watcher(setting.feeder, setting.model).design
     known = learned(setting) if setting.learned else None
     return made, init(made, START, known)
+
+
+def begin(setting: Setting, estimator: str) -> tuple[DesignedEstimator, Any]:
+    """An estimator that learns, and its state before the first frame."""
+    made = watcher(setting.feeder, setting.model, estimator=estimator)
+    learning = made.family.bias_learning
+    if not setting.learned or learning is None:
+        return made, made.init(START)
+    return made, learning.init(made.design, START, _commission(setting, estimator))
+
+
+@lru_cache(maxsize=64)
+def _commission(setting: Setting, estimator: str) -> Commission:
+    """Knowledge of the fixed errors after the six honest hours of `learned`."""
+    made = watcher(
+        setting.feeder, setting.model, step_s=LEARN_STEP_S, commission_s=LEARN_S, estimator=estimator
+    )
+    first = START - LEARN_S - 2.0 * LEARN_STEP_S
+    state = made.init(first)
+    for frame, _ in play(setting, START - first, step_s=LEARN_STEP_S, start=first):
+        state, _, verdict = made.step(state, frame)
+        if verdict.suspects.any():
+            raise RuntimeError(f"{setting}: a meter is named while errors are learned")
+    learning = made.family.bias_learning
+    if learning is None:
+        raise RuntimeError(f"{estimator} does not learn")
+    known = learning.commission(state)
+    return replace(known, learning=None)
 
 
 @lru_cache(maxsize=64)

@@ -1,13 +1,14 @@
-"""Honest meters accused by the default monitor: situations, feeders, learned errors or not, powers unread.
+"""Honest meters accused by an estimator: situations, feeders, learned errors or not, powers unread.
 
     python -m benchmarks.accusations [--runs 20] [--processes 1] [--situation NAME ...] [--seed0 0]
-        [--feeder NAME] [--model NAME] [--learned yes|no] [--trace]
+        [--feeder NAME] [--model NAME] [--learned yes|no] [--estimator NAME] [--trace]
 
 Every run has 20 honest seconds and 90 seconds of a manipulation, one frame per second, AC power flow as the
 truth. Situation and seed determine the run: feeder, learned errors (six hours, a tick of 300 s) or accuracy
 classes alone, knowledge of the powers, and size. `matched`: registers and power factors err as the files say.
 `unread`: 5 % of the customers report no power. `loads`: errors of 0.6 kW and 0.2 kvar, known as such. Filters
-skip seeds and do not change the others.
+skip seeds and do not change the others. `--estimator modal` watches the same data; the linear programs of
+`stealthy` then still know the limits of the default monitor.
 
 Per situation: runs; runs with an honest meter accused; most honest meters accused in a run; runs with an
 honest busbar meter or inverter accused; ticks CLEAN, UNDECIDED and ATTACKED after the onset, %; manipulated
@@ -40,6 +41,7 @@ from benchmarks._scenes import (
     WATCHED_S,
     Model,
     Setting,
+    begin,
     beyond,
     neighbours,
     phase_of,
@@ -50,6 +52,7 @@ from benchmarks._scenes import (
     street,
 )
 from feeders.model.site import Site
+from feeders.registry import MODAL, SEQUENTIAL
 from feeders.simulation.scenario import START
 from feeders.simulation.trial import FrameTruth
 from gridsec.arrays import Floats, Ints
@@ -76,7 +79,7 @@ class Stage:
     where
         The feeder.
     design, state, frame
-        The monitor, its state after the honest seconds, and the last honest frame.
+        The default monitor, its state after the honest seconds, and the last honest frame.
     random
         Random numbers of the run.
     size
@@ -282,7 +285,7 @@ class Run:
     trace: list[str] = field(default_factory=list)
 
 
-def run(name: str, seed: int, *, trace: bool = False) -> Run:
+def run(name: str, seed: int, *, trace: bool = False, estimator: str = SEQUENTIAL) -> Run:
     """Play and watch one run.
 
     Parameters
@@ -291,26 +294,33 @@ def run(name: str, seed: int, *, trace: bool = False) -> Run:
         Situation and seed.
     trace
         Whether to keep a line for every tick.
+    estimator
+        Name of an estimator.
     """
     begun = time.perf_counter()
     setting, size = cell(name, seed)
     where = site(setting.feeder)
     known = "learned" if setting.learned else "classes"
     out = Run(name, seed, f"{setting.feeder} {setting.model} {known} {size:g}")
-    made, state = start(setting)
+    made, state = begin(setting, estimator)
+    default, given = (made.design, state) if estimator == SEQUENTIAL else start(setting)
     frame = None
     p = where.meters.size
     accused, manipulated, named = np.zeros((3, p), dtype=np.bool_)
     for frame, _ in play(setting, ONSET_S):
-        state, _, verdict = step(made, state, frame)
+        state, _, verdict = made.step(state, frame)
+        if estimator == SEQUENTIAL:
+            given = state
+        elif name.startswith("stealthy"):
+            given, *_ = step(default, given, frame)
         accused |= verdict.suspects
     assert frame is not None
     random = np.random.default_rng([seed, sum(map(ord, name))])
-    attacks, off = SITUATIONS[name].make(Stage(where, made, state, frame, random, size))
+    attacks, off = SITUATIONS[name].make(Stage(where, default, given, frame, random, size))
     for frame, truth in play(setting, ONSET_S + WATCHED_S, attacks=attacks, busbar=off):
         if frame.t < T_ON:
             continue
-        state, estimate, verdict = step(made, state, frame)
+        state, estimate, verdict = made.step(state, frame)
         manipulated |= truth.liars
         accused |= verdict.suspects & ~truth.liars
         named |= verdict.suspects & truth.liars
@@ -402,7 +412,7 @@ def main(asked: argparse.Namespace) -> int:
         go = pool.map if asked.processes > 1 else map
         for name in names:
             chosen = list(seeds(name, asked))
-            runs = list(go(partial(run, name, trace=asked.trace), chosen))
+            runs = list(go(partial(run, name, trace=asked.trace, estimator=asked.estimator), chosen))
             if not runs:
                 print(f"| {name} | 0 |" + " |" * 11)
                 continue
@@ -429,6 +439,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--feeder")
     parser.add_argument("--model", choices=[str(each) for each in Model])
     parser.add_argument("--learned", choices=["yes", "no"])
+    parser.add_argument("--estimator", default=SEQUENTIAL, choices=(SEQUENTIAL, MODAL))
     parser.add_argument("--trace", action="store_true")
     return parser
 

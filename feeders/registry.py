@@ -37,6 +37,7 @@ from gridsec.estimators import (
     windowed,
 )
 from gridsec.estimators.exact_bank.bank import MOST_OBSERVERS, Gains
+from gridsec.estimators.modal import monitor as modal
 from gridsec.estimators.sequential import Commission, LearningProgress, SuspicionRecord
 from gridsec.estimators.sequential.search import Decoder
 from gridsec.interface import Estimate, Frame, Verdict
@@ -50,6 +51,7 @@ __all__ = [
     "DIRECT",
     "FAMILIES",
     "LMI",
+    "MODAL",
     "SEQUENTIAL",
     "BankGains",
     "BiasLearning",
@@ -89,9 +91,10 @@ class BiasLearning:
     commission: Callable[[Any], Commission]  # `commission(state)`: present knowledge of the fixed errors
     # `renew(design, state, which)`: state after replacement of meters; their learning restarts
     renew: Callable[[Any, Any, Bools], Any]
-    # `read(design, arrays)`: inverse of `gridsec.estimators.sequential.to_arrays`; a `ValueError` names every
-    # contradiction to the design
+    # `read(design, arrays)`: inverse of `arrays`; a `ValueError` names every contradiction to the design
     read: Callable[[Any, Mapping[str, Floats]], Commission]
+    # `arrays(design, commission)`: persistent form, arrays of one number per meter by name
+    arrays: Callable[[Any, Commission], dict[str, Floats]]
     # `progress(design, commission)`: state and reason of each meter, and the expected time
     progress: Callable[[Any, Commission], LearningProgress]
 
@@ -339,6 +342,9 @@ def bank_gains(
 SEQUENTIAL: Final = "sequential"
 """One observer, a decoder with correlated load errors, evidence on several time scales."""
 
+MODAL: Final = "modal"
+"""One Kalman filter of loads and fixed errors, one e-detector, one search over subsets."""
+
 DIRECT: Final = "exact-bank"
 """The two banks of chong2020 with direct injection and a closed-form certificate for all sets at once."""
 
@@ -381,6 +387,19 @@ def _sequential(site: Site, _: DesignOptions) -> sequential.SequentialDesign:
         unread_std_percent=settings.unread_std_percent,
     )
     return sequential.design(plant(site), doubt=load_doubt(site), step_s=settings.tick_s, options=options)
+
+
+def _modal(site: Site, _: DesignOptions) -> modal.ModalDesign:
+    settings = site.tables.meta.monitor
+    options = sequential.SequentialOptions(
+        alarms_per_year=settings.alarms_per_year,
+        commission_s=settings.commission_s,
+        unread_std_percent=settings.unread_std_percent,
+    )
+    most = np.maximum(site.loads.load_peak, site.loads.pv_peak)
+    return modal.design(
+        plant(site), doubt=load_doubt(site), step_s=settings.tick_s, options=options, most=most
+    )
 
 
 def _lmi_bank(site: Site, job: DesignOptions) -> exact_bank.MonitorDesign:
@@ -534,9 +553,29 @@ FAMILIES: Final = Families(
                 commission=lambda state: state.commission,
                 renew=sequential.renew,
                 read=sequential.from_arrays,
+                arrays=lambda _, known: sequential.to_arrays(known),
                 progress=sequential.progress,
             ),
             warm_start=WarmStart(sequential.distrusted, sequential.warm_start),
+        ),
+        replace(
+            _of(
+                modal,
+                MODAL,
+                "one filter of loads and meter errors, an e-detector, a search over subsets",
+                design=_modal,
+            ),
+            withstands=lambda d: int(d.max_attacked),
+            bias_learning=BiasLearning(
+                needed_s=lambda d: float(d.options.commission_s),
+                init=modal.init,
+                commission=lambda state: state.commission,
+                renew=modal.renew,
+                read=modal.from_arrays,
+                arrays=modal.to_arrays,
+                progress=modal.progress,
+            ),
+            warm_start=WarmStart(modal.distrusted, modal.warm_start),
         ),
         _of(exact_bank, DIRECT, "banks of circle-criterion observers, direct injection (chong2020)"),
         _of(exact_bank, LMI, "the same banks, gains by matrix inequality (chong2020)", design=_lmi_bank),

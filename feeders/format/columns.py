@@ -238,6 +238,7 @@ LINE_PHASES: Final = (*PHASES, "ab", "bc", "ca")
 SUSPICIONS: Final = ("voltage", "impedance", "ratio", "rating", "load", "class")
 OWN_ESTIMATORS: Final = (
     "sequential",
+    "modal",
     "exact-bank",
     "exact-bank-lmi",
     "windowed-bank",

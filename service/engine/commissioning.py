@@ -227,7 +227,14 @@ class FeederCommissioning:
         """Return the present state for the store; None before the first tick."""
         if self.known is None or self._t is None:
             return None
-        return encode(self._site, self._fingerprint, self._t, to_arrays(self.known))
+        return encode(self._site, self._fingerprint, self._t, self._arrays(self.known))
+
+    def _arrays(self, known: Commission) -> dict[str, Floats]:
+        """Persistent form of a commissioning; the restored one before the design is that of the store."""
+        learner, watcher = self.learner, self._watcher
+        if learner is None or watcher is None:
+            return to_arrays(known)
+        return learner.arrays(watcher.design, known)
 
     def due(
         self, *, at_once: bool = False

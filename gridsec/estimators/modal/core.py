@@ -203,8 +203,13 @@ def init(core: Core, t: float) -> CoreState:
     return CoreState(*parts, None, History((*parts, ())), (), masking.none(made))
 
 
-def step(
-    core: Core, state: CoreState, t: float, m: Floats, seen: Bools | None = None
+def step(  # noqa: PLR0917  # the state, and one tick
+    core: Core,
+    state: CoreState,
+    t: float,
+    m: Floats,
+    seen: Bools | None = None,
+    unknown: Floats | None = None,
 ) -> tuple[CoreState, Evidence]:
     """Take in the residuals of one tick.
 
@@ -218,6 +223,9 @@ def step(
         Residuals, squared pu; any finite value where not seen.
     seen : (p,)
         Meters with a reading; None: all.
+    unknown : (p, k)
+        Directions of the residuals that are unknown at this tick, times their standard deviations; None for
+        none. The tick says nothing about them where the standard deviations are large.
 
     Raises
     ------
@@ -228,7 +236,9 @@ def step(
     if masked.meters.any():
         seen = ~masked.meters if read is None else read & ~masked.meters
     pinned = np.flatnonzero(state.detector.pinned).tolist()
-    after, known, update = full.step(made, state.filter, state.static, t, m, seen, stay=bool(pinned))
+    after, known, update = full.step(
+        made, state.filter, state.static, t, m, seen, stay=bool(pinned), unknown=unknown
+    )
     test, evidence = detector.step(
         made, core.faults, state.detector, update, known, h=h, alert=CALM * core.limit
     )
@@ -239,17 +249,17 @@ def step(
         if pinned and not suspected:
             suspected = replay.carried(made, state.detector.onsets, state.static, pinned)
         suspected = tuple(replay.follow(made, each, update.exact, h) for each in suspected)
-    others = tuple(rivals.follow(each, t, m, seen) for each in state.rivals)
+    others = tuple(rivals.follow(each, t, m, seen, unknown) for each in state.rivals)
     if evidence.log_m >= core.limit and (not pinned or (suspected and _elsewhere(evidence, pinned))):
         test = detector.pin(test, evidence.rows)
-        last = replay.record(state.history, (after, known, test, ()), m, seen)
+        last = replay.record(state.history, (after, known, test, ()), m, seen, unknown)
         others = rivals.replayed(made, core.rivals, last, test.onsets, int(evidence.rows[0]))
         if update.exact is not None:
             rows = np.flatnonzero(test.pinned).tolist()
             suspected = replay.replayed(made, last, test.onsets, rows)
     elif pinned and evidence.log_m < CALM * core.limit:
         test, suspected, others = detector.pin(test, evidence.rows[:0]), (), ()
-    history = replay.record(state.history, (after, known, test, suspected), m, seen)
+    history = replay.record(state.history, (after, known, test, suspected), m, seen, unknown)
     return CoreState(after, known, test, update, history, suspected, masked, others), evidence
 
 
@@ -279,9 +289,9 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
     parts = before, known, test
     now = CoreState(*parts, None, History((*parts, ())), (), masking.none(core.modes))
     evidence = Evidence(-inf, np.full(test.capital.shape, -inf))
-    for k, (t, m, seen) in enumerate(history.readings):
+    for k, (t, m, seen, unknown) in enumerate(history.readings):
         read = seen if k < first else ~named if seen is None else seen & ~named
-        now, evidence = step(core, now, t, m, read)
+        now, evidence = step(core, now, t, m, read, unknown)
     return replace(now, masked=masking.added(state.masked, named)), evidence
 
 

@@ -62,6 +62,7 @@ def step(  # noqa: PLR0917  # the states of both parts, and one tick
     seen: Bools | None = None,
     *,
     stay: bool = False,
+    unknown: Floats | None = None,
 ) -> tuple[FilterState, Static, Update]:
     """Take in the residuals of one tick by the exact filter.
 
@@ -77,20 +78,23 @@ def step(  # noqa: PLR0917  # the states of both parts, and one tick
         Members with a reading; None: all.
     stay
         Keep the full covariance, if there is one.
+    unknown : (t, k)
+        Directions of the residuals that are unknown at this tick, times their standard deviations; None for
+        none.
 
     Raises
     ------
     ValueError
         If t is before the last reading or not a number.
     """
-    whole = seen is None or all_of(seen)
+    whole = (seen is None or all_of(seen)) and unknown is None
     if state.full is not None and whole and not stay and state.full.complete >= COMPLETE:
         state, known = _returned(modes, state, state.full, known)
     if state.full is None and not whole:
         state = replace(state, full=expanded(modes, state, known))
     after, update = modal.step(modes, state, t, m, seen)
     if state.full is not None:
-        full, innovation = updated(modes, state.full, t - state.t, m, None if whole else seen)
+        full, innovation = updated(modes, state.full, t - state.t, m, None if whole else seen, unknown)
         sigma, _ = lapack.dtrtrs(innovation.half, innovation.white, lower=True, trans=1)
         score = sigma @ modes.back[innovation.rows]
         kept, slower = _kept(modes, full.kept, update)
@@ -123,7 +127,14 @@ def _turned(modes: Modes, known: Static) -> Floats:
     return np.vstack([modes.back @ -g_w, modes.back @ (modes.directions - g_b)])
 
 
-def updated(modes: Modes, before: Full, h: float, m: Floats, seen: Bools | None) -> tuple[Full, Innovation]:
+def updated(  # noqa: PLR0917  # the filter, and one tick
+    modes: Modes,
+    before: Full,
+    h: float,
+    m: Floats,
+    seen: Bools | None,
+    unknown: Floats | None = None,
+) -> tuple[Full, Innovation]:
     """The exact filter after one tick; O(n t^2).
 
     Parameters
@@ -134,6 +145,8 @@ def updated(modes: Modes, before: Full, h: float, m: Floats, seen: Bools | None)
         Interval, s.
     m, seen : (t,)
         Residuals, and members with a reading; None: all.
+    unknown : (t, k)
+        As in `step`: ``unknown unknown'`` is added to the covariance of the white errors of this tick.
     """
     t, rows = modes.size, np.arange(modes.size) if seen is None else indices(seen)
     rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
@@ -155,6 +168,8 @@ def updated(modes: Modes, before: Full, h: float, m: Floats, seen: Bools | None)
     else:
         nu, HP, D, complete = nu[rows], P[rows] + P[t + rows], submatrix(modes.noise, rows, rows), 0
         V = (HP[:, :t] + HP[:, t:])[:, rows] + D
+    if unknown is not None:
+        V, complete = V + unknown[rows] @ unknown[rows].T, 0
     half, failed = lapack.dpotrf(V.T, lower=True, overwrite_a=True, clean=True)
     if failed:
         raise np.linalg.LinAlgError("the covariance of the innovation is not positive definite")

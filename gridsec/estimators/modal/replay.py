@@ -33,7 +33,8 @@ from gridsec.estimators.modal.static import Static
 HALF = 64
 """Ticks from one kept state of the filter to the next; two of them cover the readings that are kept."""
 
-Reading = tuple[float, Floats, Bools | None]
+Reading = tuple[float, Floats, Bools | None, Floats | None]
+"""Time, residuals (t,), members with a reading (t,), and unknown directions (t, k) of a tick."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +77,7 @@ class History:
     start
         Filter, directions, detector and suspected onsets before the first reading.
     readings
-        Time, residuals and members with a reading of each tick, at most ``2 HALF``.
+        The ticks, at most ``2 HALF``.
     middle
         As ``start``, after the first `HALF` readings; None before.
     """
@@ -86,7 +87,9 @@ class History:
     middle: Parts | None = field(default=None, repr=False)
 
 
-def record(history: History, after: Parts, m: Floats, seen: Bools | None) -> History:
+def record(
+    history: History, after: Parts, m: Floats, seen: Bools | None, unknown: Floats | None = None
+) -> History:
     """Keep the readings of one tick.
 
     Parameters
@@ -97,8 +100,10 @@ def record(history: History, after: Parts, m: Floats, seen: Bools | None) -> His
         Filter, directions, detector and suspected onsets after the tick.
     m, seen : (t,)
         Residuals, and members with a reading.
+    unknown : (t, k)
+        Unknown directions.
     """
-    readings = (*history.readings, (after[0].t, m, seen))
+    readings = (*history.readings, (after[0].t, m, seen, unknown))
     if len(readings) == HALF:
         return replace(history, readings=readings, middle=after)
     if len(readings) == 2 * HALF and history.middle is not None:
@@ -119,9 +124,9 @@ def replayed(modes: Modes, history: History, onsets: Onsets, rows: Sequence[int]
     count, (state, known, *_) = len(history.readings), history.start
     t, full = state.t, exact.expanded(modes, state, known) if state.full is None else state.full
     out = {row: begun(modes, row, bool(onsets.ramp[row])) for row in rows}
-    for k, (now, m, seen) in enumerate(history.readings):
+    for k, (now, m, seen, unknown) in enumerate(history.readings):
         h = now - t
-        full, innovation = exact.updated(modes, full, h, m, seen)
+        full, innovation = exact.updated(modes, full, h, m, seen, unknown)
         for row in rows:
             if onsets.age[row] >= count - k:
                 out[row] = follow(modes, out[row], innovation, h)

@@ -158,12 +158,20 @@ def replayed(
     if older and (state.full is None or exactly is not None):
         begin, one = -1, signatures.single(had, row)
     out = [replace(each, onsets=one, suspected=exactly) for each in first(modes, others, history)]
-    for k, (t, m, seen) in enumerate(history.readings):
-        out = [follow(each, t, m, seen, begun=k == begin) for each in out]
+    for k, (t, m, seen, unknown) in enumerate(history.readings):
+        out = [follow(each, t, m, seen, unknown, begun=k == begin) for each in out]
     return tuple(out)
 
 
-def follow(before: Rival, t: float, m: Floats, seen: Bools | None, *, begun: bool = False) -> Rival:
+def follow(  # noqa: PLR0917  # the rival, and one tick
+    before: Rival,
+    t: float,
+    m: Floats,
+    seen: Bools | None,
+    unknown: Floats | None = None,
+    *,
+    begun: bool = False,
+) -> Rival:
     """Take in the residuals of one tick.
 
     Parameters
@@ -174,22 +182,24 @@ def follow(before: Rival, t: float, m: Floats, seen: Bools | None, *, begun: boo
         Time, s.
     m, seen : (p,)
         Residuals, and members with a reading; None: all.
+    unknown : (p, k)
+        Unknown directions, as in `gridsec.estimators.modal.full.step`.
     begun
         The onset is at this tick.
     """
     modes, state, known, h = before.modes, before.filter, before.static, t - before.filter.t
     total, onsets, suspected, jumps = before.sum, before.onsets, before.suspected, before.jumps
-    if state.full is None and not (seen is None or all_of(seen)):
+    if state.full is None and not ((seen is None or all_of(seen)) and unknown is None):
         total += _of_theta(modes, known) - before.known
         if onsets.used[0]:
             (suspected,) = replay.carried(modes, onsets, known, [0])
         state = replace(state, full=exact.expanded(modes, state, known))
     size = 0.0
     if jumps is not None:
-        size, prior = _jump(modes, state, known, h, m, seen)
+        size, prior = _jump(modes, state, known, h, m, seen, unknown)
         total, jumps = total + prior, jumps + (size > 0.0)
         state = _jumped(modes, state, h, size)
-    state, known, update = exact.step(modes, state, known, t, m, seen, stay=True)
+    state, known, update = exact.step(modes, state, known, t, m, seen, stay=True, unknown=unknown)
     if update.exact is None:
         total -= 0.5 * float((update.innovation**2 / update.variance + np.log(update.variance)).sum())
         onsets = signatures.follow(modes, onsets, update, known, h, begun=[0] if begun else [])
@@ -225,7 +235,13 @@ def _of_theta(modes: Modes, known: Static) -> float:
 
 
 def _jump(  # noqa: PLR0917  # the states of both parts, and one tick
-    modes: Modes, state: FilterState, known: Static, h: float, m: Floats, seen: Bools | None
+    modes: Modes,
+    state: FilterState,
+    known: Static,
+    h: float,
+    m: Floats,
+    seen: Bools | None,
+    unknown: Floats | None,
 ) -> tuple[float, float]:
     """The likeliest jump of a tick, in the variances of the loads, and the logarithm of its prior."""
     rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
@@ -247,6 +263,8 @@ def _jump(  # noqa: PLR0917  # the states of both parts, and one tick
             return 0.0, priors[0]
         nu = (m - rho * state.full.mean[0] - rho_b * state.full.mean[1])[n]
         V, S = exact.expected(modes, state.full, h, n), submatrix(modes.jumps, n, n)
+        if unknown is not None:
+            V = V + unknown[n] @ unknown[n].T
         each = []
         for prior, size in zip(priors, sizes, strict=True):
             half, _ = lapack.dpotrf(V + size * S, lower=True, clean=True)

@@ -540,10 +540,13 @@ def search(
 def _descended(problem: SearchProblem, starts: tuple[Bools, ...], groups: Groups) -> Tableau:
     """The cheapest set from some starts, with the prior size that it has."""
     best = _best(tuple(_at(problem, start) for start in starts), groups)
-    sized = _sized(problem, best.chosen)
-    if sized is problem:
-        return best
-    return _best(tuple(_at(sized, start) for start in (best.chosen, starts[-1])), groups)
+    sizes = (_sized(problem, best.chosen), _sized(problem, starts[-1]))
+    ends = [
+        _best(tuple(_at(sized, start) for start in (best.chosen, starts[-1])), groups)
+        for sized in sizes
+        if sized is not problem
+    ]
+    return min(ends, key=lambda end: end.cost) if ends else best
 
 
 def _explored(best: Tableau, groups: tuple[Ints, ...], batches: Groups) -> dict[bytes, float]:

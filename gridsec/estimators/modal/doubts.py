@@ -1,0 +1,172 @@
+"""Directions of the residuals that one frame leaves unknown: unread powers, late ones, the busbar, clocks.
+
+The model of the residuals is fixed by the feeder's files. A frame may know less: a power without a reading,
+an interval far wider than the files state, an inverter that has not settled, a missing busbar voltage, a
+clock offset. Each such error d moves the residuals along one known column a, with unknown time dependence:
+
+    m_t = w_t + b_t + e_t + f_t + A_t d_t
+
+The filter treats ``A_t d_t`` as white with `WIDER` times its standard deviation. A tick then says nothing
+along A_t. For one column, with ``q = a' V^-1 a``, a lasting error d leaves
+
+    a' (V + s^2 a a')^-1 a d = q d / (1 + s^2 q)  <=  d / s^2
+
+per tick in the score, in place of ``q d``: nothing accumulates, whatever the correlation in time. The price
+is evidence against a fault along a. It is unavoidable where the error may last.
+
+The estimate uses the standard deviations themselves: d is estimated from the residuals of the same tick,
+
+    d_hat = A_n' (A_n A_n' + D_n)^-1 u_n,   u = m - E[w + b],
+
+n being the meters with a reading.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from gridsec.arrays import Bools, Floats, any_of, indices
+from gridsec.estimators.modal.model import Modes
+from gridsec.estimators.plant import usual
+from gridsec.estimators.sequential.design import SequentialDesign
+from gridsec.estimators.sequential.measurements import ClockSkew, FrameUncertainty, Measurements
+from gridsec.estimators.sequential.posterior import EXACT, UNMETERED
+from gridsec.estimators.sequential.state import Prediction
+
+WIDER = 10.0
+"""Factor on the standard deviations of unknown directions, 1: a lasting error leaves 1 % of its evidence."""
+UNSETTLED = 4.0
+"""Ratio of an injection's error to the design's from which on the injection is unknown, 1."""
+SKEWED = 0.5
+"""Change of a voltage within a clock offset from which on the reading is unknown, in white deviations, 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Unknown:
+    """Unknown directions of one frame, times their standard deviations. n places, p meters, k directions.
+
+    Attributes
+    ----------
+    places : (n, k)
+        Effect on the true voltages beyond the model, squared pu.
+    meters : (p, k)
+        Effect on the residuals, squared pu.
+    unchecked : (p,)
+        Meters with a reading that no known power checks.
+    """
+
+    places: Floats = field(repr=False)
+    meters: Floats = field(repr=False)
+    unchecked: Bools
+
+    @property
+    def wide(self) -> Floats:
+        """Directions for the filter, (p, k)."""
+        return WIDER * self.meters
+
+
+def unknown(
+    design: SequentialDesign,
+    measured: Measurements,
+    uncertainty: FrameUncertainty,
+    predicted: Prediction,
+    skew: ClockSkew | None,
+) -> Unknown | None:
+    """Directions that a frame leaves unknown; None for none.
+
+    Parameters
+    ----------
+    design, measured
+        The front end, and the measurements of the frame.
+    uncertainty
+        Uncertainty of the frame beyond that of the design.
+    predicted
+        The frame by the model.
+    skew
+        Changes of the voltages within clock offsets.
+    """
+    frame, doubt = usual(measured.frame), design.doubt
+    p = _wider(frame.p_error, doubt.p, uncertainty.p[0])
+    q = _wider(frame.q_error, doubt.q, uncertainty.q[0])
+    power = np.concatenate([p, np.hypot(q, _unsettled(design, predicted, measured.uses_q))])
+    which = indices(power > 0.0)
+    columns = [design.sensitivities.numbered(which) * power[which]] if which.size else []
+    metered = np.atleast_1d(np.asarray(measured.busbar_metered))
+    places = design.prior.variance.size
+    for phase in np.flatnonzero(~metered).tolist():
+        at = np.arange(places) % metered.size == phase
+        columns.append(UNMETERED * at[:, None].astype(np.float64))
+    clocks = _clocks(design, measured, skew)
+    if not columns and clocks is None:
+        return None
+    whole = np.hstack(columns) if columns else np.zeros((places, 0))
+    meters = whole[design.prior.meters]
+    if clocks is not None:
+        whole = np.hstack([whole, np.zeros((places, clocks.shape[1]))])
+        meters = np.hstack([meters, clocks])
+    return Unknown(whole, meters, measured.available & ~uncertainty.vouched[0])
+
+
+def _wider(error: Floats, known: Floats, factor: Floats) -> Floats:
+    """Standard deviations of the parts of powers' errors that the design does not contain, (N,), pu."""
+    more = np.maximum(error * error / 3.0 - np.maximum(known, EXACT) ** 2, 0.0)
+    return np.where(factor > 1.0, np.sqrt(more), 0.0)
+
+
+def _unsettled(design: SequentialDesign, predicted: Prediction, metered: Bools) -> Floats:
+    """Standard deviation of injections known far less well than the design supposes, (N,), pu."""
+    droop, N = design.plant.droop, design.customers
+    error = droop.per_customer(predicted.injection_error.error, N) / np.sqrt(3.0)
+    usually = design.injections + droop.per_customer(design.mismatch, N)
+    return np.where((error > UNSETTLED * np.maximum(usually, EXACT)) & ~metered, error, 0.0)
+
+
+def _clocks(design: SequentialDesign, measured: Measurements, skew: ClockSkew | None) -> Floats | None:
+    """Directions of meters with a voltage that changes within their clock offset, (p, k); None for none."""
+    if skew is None:
+        return None
+    change = skew.change[-1]
+    moved = measured.available & (change > SKEWED * np.sqrt(design.white))
+    if not any_of(moved):
+        return None
+    at = indices(moved)
+    out = np.zeros((change.size, at.size))
+    out[at, np.arange(at.size)] = change[at]
+    return out
+
+
+def estimated(modes: Modes, given: Unknown, u: Floats, seen: Bools) -> tuple[Floats, Floats]:
+    """Mean and variance of the unknown errors at all places, (n,) each, squared pu and squared pu^2.
+
+    A reading that no known power checks may be false. Let m' and V' be the mean and the variance without all
+    of these readings, and m the mean with them: the variance is ``V' + (m - m')^2`` about m.
+
+    Parameters
+    ----------
+    modes, given
+        The modes, and the unknown directions.
+    u : (p,)
+        Residuals less the posterior means of w and b.
+    seen : (p,)
+        Meters with a reading in use.
+    """
+    mean, variance = _regressed(modes, given, u, seen)
+    if any_of(given.unchecked & seen):
+        other, variance = _regressed(modes, given, u, seen & ~given.unchecked)
+        variance = variance + (mean - other) ** 2
+    return mean, variance
+
+
+def _regressed(modes: Modes, given: Unknown, u: Floats, seen: Bools) -> tuple[Floats, Floats]:
+    """Regression on the meters `seen` (p,)."""
+    n, A = indices(seen), given.meters
+    variance = (given.places**2).sum(axis=1)
+    if not n.size:
+        return np.zeros(variance.size), variance
+    factor = cho_factor(modes.noise[np.ix_(n, n)] + A[n] @ A[n].T)
+    cross = A[n] @ given.places.T
+    gain = cho_solve(factor, cross)
+    return gain.T @ u[n], np.maximum(variance - (gain * cross).sum(axis=0), 0.0)

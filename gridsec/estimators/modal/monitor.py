@@ -1,0 +1,758 @@
+"""Estimator `modal`: the statistical core as a monitor of a feeder.
+
+    design(plant, doubt=..., step_s=...) -> ModalDesign
+    init(design, t) -> ModalState
+    step(design, state, frame) -> (ModalState, Estimate, Verdict)
+
+A step, by module:
+
+    sequential.measurements, step   front end: plausibility, observer of the inverters with its certificate,
+                                    loss-corrected voltages by the model
+    doubts                          directions that the frame leaves unknown
+    core                            filter, detector, search, masking
+    verdict                         evidence of each meter, decision, explanations
+
+The residual of a meter is its squared reading less the model; fixed errors are states of the filter. A meter
+is named when `CONFIRM` searches in turn name it, or when it repeats its readings beyond chance. Named meters
+are masked from the onset of the manipulation on, and released by their readings (`masking`). The busbar's
+meter is named likewise; its phase then counts as not metered, until the meters agree with its reading again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, changed
+from gridsec.estimators.modal import core, detector, doubts, full, masking, record, verdict
+from gridsec.estimators.modal.core import Core, CoreState, Suspicion
+from gridsec.estimators.modal.detector import Evidence
+from gridsec.estimators.modal.doubts import Unknown
+from gridsec.estimators.modal.record import Record
+from gridsec.estimators.modal.replay import History
+from gridsec.estimators.plant import Plant, nothing_new
+from gridsec.estimators.sequential import design as front_design
+from gridsec.estimators.sequential import init as front_init
+from gridsec.estimators.sequential import meter_bias
+from gridsec.estimators.sequential import state as front_state
+from gridsec.estimators.sequential.attack_kind import (
+    AttackKinds,
+    classify,
+    forget_readings,
+    ingest,
+    repeat_lags,
+)
+from gridsec.estimators.sequential.design import SequentialDesign, SequentialOptions
+from gridsec.estimators.sequential.device_checks import BusbarTrust, track_busbar
+from gridsec.estimators.sequential.measurements import (
+    FrameUncertainty,
+    Measurements,
+    checked,
+    measurements,
+    plausible,
+    update_skew,
+    update_uncertainty,
+    without_shifted_busbar,
+)
+from gridsec.estimators.sequential.meter_bias import (
+    Commission,
+    Learned,
+    Learning,
+    LearningProgress,
+    LearningTick,
+    gather,
+    ready_meters,
+    usable,
+)
+from gridsec.estimators.sequential.output import BoundedEstimate, BoundInputs
+from gridsec.estimators.sequential.posterior import UNMETERED, LoadDoubt
+from gridsec.estimators.sequential.state import Prediction, SequentialState, SuspicionRecord
+from gridsec.estimators.sequential.step import predict
+from gridsec.interface import Estimate, Frame, Verdict
+from gridsec.observers.certificates import Certificate
+
+CONFIRM = 2
+"""Searches in turn that name a meter before it is named: one reading may be an outlier."""
+LOOKS = 16
+"""Searches per age of the suspected onset: explanations change ever more slowly."""
+SETTLING = 32
+"""Largest number of ticks at the start of a run that the core gives up for complete readings."""
+JUMP = 6.0
+"""Standard deviations of an innovation beyond which a reading does not drive an inverter, 1."""
+PAUSE = 60.0
+"""Ticks without a frame that count as a pause for the time of commissioning."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModalDesign:
+    """Offline design. p meters.
+
+    Attributes
+    ----------
+    front
+        Design of the front end.
+    core
+        The statistical core.
+    own : (p, p)
+        Regression of the meters' own fixed errors on all errors that last: ``diag(fixed) B^-1``.
+    """
+
+    front: SequentialDesign
+    core: Core
+    own: Floats = field(repr=False)
+
+    @property
+    def plant(self) -> Plant:
+        """The feeder."""
+        return self.front.plant
+
+    @property
+    def options(self) -> SequentialOptions:
+        """Tuning parameters of the front end; rate of false alarms and time of commissioning of the whole."""
+        return self.front.options
+
+    @property
+    def certificate(self) -> Certificate:
+        """Certificate of the observer of the inverters."""
+        return self.front.certificate
+
+    @property
+    def max_attacked(self) -> int:
+        """Largest number of manipulated meters told apart."""
+        return self.front.max_attacked
+
+    @property
+    def observers(self) -> int:
+        """One observer for every trusted set."""
+        return self.front.observers
+
+
+def design(
+    plant: Plant,
+    *,
+    doubt: LoadDoubt,
+    step_s: float,
+    options: SequentialOptions | None = None,
+    max_attacked: int | None = None,
+    most: Floats | None = None,
+) -> ModalDesign:
+    """Design the monitor of a feeder.
+
+    most: (N,) largest active powers that the customers can have, pu. Others as in
+    `gridsec.estimators.sequential.design.design`, and its errors.
+    """
+    front = front_design(plant, doubt=doubt, step_s=step_s, options=options, max_attacked=max_attacked)
+    kernel = core.design(front, most)
+    own = np.asarray(np.linalg.solve(kernel.modes.covariance_b, np.diag(kernel.model.fixed)).T, np.float64)
+    return ModalDesign(front, kernel, own)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModalState:
+    """State between frames. p meters.
+
+    Attributes
+    ----------
+    front
+        State of the front end: observer, uncertainty, trust, time of commissioning, last output.
+    core
+        State of the core.
+    suspicion
+        Explanations of the last search, while they hold.
+    streak : (p,)
+        Searches in turn that name each meter.
+    phases : (b,)
+        Searches in turn that name each phase of the busbar with a meter.
+    due
+        Number of the tick of the next search.
+    kept
+        Record of the learned errors; None before the first tick.
+    """
+
+    front: SequentialState
+    core: CoreState
+    suspicion: Suspicion | None
+    streak: Ints
+    phases: Ints
+    due: int
+    kept: Record | None
+
+    @property
+    def commission(self) -> ModalCommission:
+        """Learned errors and the time of commissioning."""
+        return ModalCommission(self.front.learned, self.front.learning, self.kept)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModalCommission(Commission):
+    """Commissioning with the record of the filter."""
+
+    kept: Record | None = field(default=None, repr=False)
+
+
+def init(design: ModalDesign, t: float, commission: Commission | None = None) -> ModalState:
+    """Initial state at Unix time t, s, with errors learned before."""
+    known = commission or meter_bias.initial(design.front, t)
+    before = known.kept if isinstance(known, ModalCommission) else None
+    front = front_init(design.front, t, known.learned, known.learning)
+    kernel, phases = design.core, design.core.faults
+    begun = _begun(kernel, before, t)
+    p = kernel.modes.size
+    counts = np.zeros(phases.std.size - p - phases.powers, dtype=np.intp)
+    return ModalState(front, begun, None, np.zeros(p, dtype=np.intp), counts, 0, before)
+
+
+def _begun(kernel: Core, before: Record | None, t: float) -> CoreState:
+    """Core before its first reading at Unix time t, s, with the errors of a record."""
+    begun = core.init(kernel, t)
+    if before is None:
+        return begun
+    # Time may have been set back since the record.
+    known = replace(before.filter, t=min(before.filter.t, t))
+    parts = known, before.known, begun.detector, ()
+    return replace(begun, filter=known, static=before.known, history=replace(begun.history, start=parts))
+
+
+def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalState, Estimate, Verdict]:
+    """Process one frame.
+
+    A frame that is not later than the last one changes nothing: it repeats the last estimate, with UNDECIDED.
+    """
+    front, given = design.front, state.front
+    if not np.isfinite(frame.t) or (given.x is not None and not frame.t > given.t):
+        none = np.zeros(front.plant.droop.tau.size)
+        estimate, answer = nothing_new(front.plant, frame, given.t, given.last, given.v0_squared, none)
+        return state, (replace(estimate, std=estimate.bound) if given.last is None else estimate), answer
+    history, frame = without_shifted_busbar(
+        front, given.busbar_history, plausible(front, frame), given.trust.trusted, given.v0_squared
+    )
+    measured = measurements(front, frame, given.trust.trusted, given.busbar.trusted, given.v0_squared)
+    uncertainty = update_uncertainty(
+        front, given.uncertainty, frame, measured.available, measured.busbar_metered
+    )
+    given, measured, predicted = _driven(design, state, given, measured, uncertainty)
+    v2 = predicted.v2_bus[front.prior.meters]
+    skew = given.clock_skew
+    if skew is not None or frame.clock_offset is not None:
+        noise = np.repeat(front.white[None, :], len(front.lengths), axis=0)
+        skew = update_skew(front, skew, given.ticks, frame.clock_offset, v2, noise)
+    kinds = ingest(front.references, given.attack_kinds, measured.y, measured.available)
+    now = changed(
+        given,
+        uncertainty=uncertainty,
+        clock_skew=skew,
+        busbar_history=history,
+        attack_kinds=kinds,
+        v0_squared=measured.v0_squared,
+    )
+    open_ = doubts.unknown(front, measured, uncertainty, predicted, skew)
+    seen = measured.available
+    m = np.where(seen, measured.y - v2, 0.0)
+    kernel = _begun_anew(design, state, frame.t) if open_ is None and all_of(seen) else state.core
+    kernel, evidence = core.step(
+        design.core,
+        _repeating(kernel, repeat_lags(kinds) > 0),
+        frame.t,
+        m,
+        None if all_of(seen) else seen,
+        None if open_ is None else open_.wide,
+    )
+    after, evidence = _identified(design, replace(state, front=now, core=kernel), evidence)
+    if not np.array_equal(after.front.busbar.trusted, now.busbar.trusted):
+        # A phase named at this tick is not metered any more.
+        metered = np.asarray(measured.busbar_metered) & after.front.busbar.trusted
+        measured = replace(measured, busbar_metered=metered if metered.size > 1 else bool(metered[0]))
+        open_ = doubts.unknown(front, measured, uncertainty, predicted, skew)
+    tick = _Tick(measured, predicted, open_, evidence, m)
+    return _answered(design, after, tick)
+
+
+def _driven(
+    design: ModalDesign,
+    state: ModalState,
+    given: SequentialState,
+    measured: Measurements,
+    uncertainty: FrameUncertainty,
+) -> tuple[SequentialState, Measurements, Prediction]:
+    """Front end, measurements and prediction without inverters driven by a reading that jumps.
+
+    A manipulated reading that drives an inverter of the model moves the residuals of all others. A reading
+    beyond `JUMP` standard deviations of its innovation therefore counts as not trusted at this tick.
+    """
+    front, kernel = design.front, state.core
+    predicted = predict(front, given, measured, uncertainty.sizes)
+    if kernel.update is None or not front.meter_of.size or given.x is None:
+        return given, measured, predicted
+    m = measured.y - predicted.v2_bus[front.prior.meters]
+    off, std = verdict.deviations(design.core, kernel, m)
+    drives = np.zeros(m.size, dtype=np.bool_)
+    drives[front.meter_of[front.meter_of >= 0]] = True
+    jumps = drives & measured.available & given.trust.trusted & (np.abs(off) > JUMP * std)
+    if not any_of(jumps):
+        return given, measured, predicted
+    trusted = given.trust.trusted & ~jumps
+    given = changed(given, trust=replace(given.trust, trusted=trusted))
+    measured = measurements(front, measured.frame, trusted, given.busbar.trusted, given.v0_squared)
+    return given, measured, predict(front, given, measured, uncertainty.sizes)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Tick:
+    """One tick after the core."""
+
+    measured: Measurements
+    predicted: Prediction
+    unknown: Unknown | None
+    evidence: Evidence
+    m: Floats  # (p,) residuals, 0 without a reading
+
+
+def _begun_anew(design: ModalDesign, state: ModalState, t: float) -> CoreState:
+    """Core at the first complete tick: the few ticks before it are not worth a full covariance."""
+    kernel = state.core
+    early = 0 < state.front.ticks <= SETTLING and kernel.filter.full is not None
+    if not early or any_of(kernel.masked.meters) or any_of(kernel.detector.pinned):
+        return kernel
+    return _begun(design.core, state.kept, t)
+
+
+def _repeating(state: CoreState, which: Bools) -> CoreState:
+    """Core with the meters masked that repeat their readings, (p,); their release begins anew."""
+    return replace(state, masked=masking.added(state.masked, which)) if any_of(which) else state
+
+
+# --- Identification ---
+
+
+def _identified(design: ModalDesign, state: ModalState, evidence: Evidence) -> tuple[ModalState, Evidence]:
+    """State after a search, if one is due, with the confirmed meters masked."""
+    kernel, tick = design.core, state.front.ticks
+    suspicion, pinned = state.suspicion, state.core.detector.pinned
+    if suspicion is not None and not pinned[suspicion.row]:
+        suspicion = None
+    if not any_of(pinned):
+        none = replace(state, suspicion=None, streak=0 * state.streak, phases=0 * state.phases, due=0)
+        return none, evidence
+    if tick < state.due or not core.alarmed(kernel, evidence):
+        return replace(state, suspicion=suspicion), evidence
+    suspicion = core.identify(kernel, state.core, evidence)
+    named = suspicion.found.named & ~state.core.masked.meters
+    streak = np.where(named, state.streak + 1, 0)
+    phases = np.where(verdict.certain_phases(kernel, suspicion), state.phases + 1, 0)
+    age = int(state.core.detector.onsets.age[suspicion.row])
+    # A meter that was named once is searched again at the next tick.
+    wait = 1 if (streak == 1).any() or (phases == 1).any() else max(1, age // LOOKS)
+    after = replace(state, suspicion=suspicion, streak=streak, phases=phases, due=tick + wait)
+    confirmed = streak >= CONFIRM
+    if any_of(confirmed):
+        found = replace(suspicion.found, named=confirmed)
+        masked, evidence = core.mask(kernel, state.core, replace(suspicion, found=found))
+        return replace(after, core=masked, suspicion=None, streak=0 * streak, due=tick + 1), evidence
+    if any_of(phases >= CONFIRM):
+        return _without_busbar(design, after, suspicion, phases >= CONFIRM)
+    if not any_of(suspicion.found.chosen[0]):
+        # Loads have changed, and no power is false.
+        adopted = core.adopt(kernel, state.core, suspicion)
+        if adopted is not state.core:
+            return replace(after, core=adopted, suspicion=None), evidence
+    return after, evidence
+
+
+def _without_busbar(
+    design: ModalDesign, state: ModalState, suspicion: Suspicion, which: Bools
+) -> tuple[ModalState, Evidence]:
+    """State without the readings of some phases of the busbar since the onset.
+
+    which: phases among those with a meter. The kept readings are replayed with a busbar voltage that is
+    unknown from the onset on.
+    """
+    front, kernel, modes = design.front, state.core, design.core.modes
+    H = modes.model.phases(modes.at)
+    named = np.zeros(H.shape[1], dtype=np.bool_)
+    named[H.any(axis=0)] = which
+    columns = doubts.WIDER * UNMETERED * H[:, named]
+    before, known, test, _ = kernel.history.start
+    first = len(kernel.history.readings) - int(kernel.detector.onsets.age[suspicion.row])
+    if first < 0:
+        test = detector.start(modes)
+    parts = before, known, detector.pin(test, np.zeros(0, np.intp)), ()
+    now = replace(
+        core.init(design.core, before.t),
+        filter=before,
+        static=known,
+        detector=parts[2],
+        history=History(parts),
+    )
+    evidence = Evidence(-np.inf, np.full(test.capital.shape, -np.inf))
+    for k, (t, m, seen, unknown) in enumerate(kernel.history.readings):
+        more = unknown if k < first else columns if unknown is None else np.hstack([unknown, columns])
+        now, evidence = core.step(design.core, now, t, m, seen, more)
+    after = replace(
+        state,
+        front=changed(state.front, busbar=_suspected_busbar(front, state.front.busbar, named)),
+        core=replace(now, masked=kernel.masked),
+        suspicion=None,
+        phases=0 * state.phases,
+        due=state.front.ticks + 1,
+    )
+    return after, evidence
+
+
+def _suspected_busbar(front: SequentialDesign, trust: BusbarTrust, named: Bools) -> BusbarTrust:
+    """Trust of the busbar's meter with newly named phases, (b,); the mean of their deviation begins."""
+    return replace(
+        trust,
+        trusted=trust.trusted & ~named,
+        scale=np.where(named, min(1, len(front.lengths) - 1), trust.scale),
+        ticks_suspect=np.where(named, 0, trust.ticks_suspect),
+        ticks_agreeing=np.where(named, 0, trust.ticks_agreeing),
+        off=np.where(named, 0.0, trust.off),
+        named=trust.named | named,
+    )
+
+
+# --- Estimate and verdict ---
+
+
+def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[ModalState, Estimate, Verdict]:
+    """State, estimate and verdict after a tick."""
+    front, kernel, now = design.front, state.core, state.front
+    named, seen = kernel.masked.meters, tick.measured.available
+    suspected = any_of(kernel.detector.pinned)
+    trust = _trust(design, now, named, state.suspicion)
+    estimate, of_busbar = _estimate(design, replace(state, front=trust), tick)
+    busbar = _busbar(design, now, tick, estimate, of_busbar)
+    evidence = verdict.meter_evidence(
+        design.core, kernel, tick.evidence, (tick.m, seen), front.options.widest, state.suspicion
+    )
+    rivals = verdict.explanations(front, design.core, state.suspicion)
+    given = verdict.Inputs(
+        frame=tick.measured.frame,
+        seen=seen,
+        named=named,
+        unread=np.zeros_like(seen) if tick.unknown is None else tick.unknown.unchecked,
+        evidence=evidence,
+        suspected=suspected,
+        explanations=rivals,
+        suspicion=state.suspicion,
+        settled=_settled(front, tick.predicted),
+        busbar=busbar.named,
+        metered=np.atleast_1d(np.asarray(tick.measured.busbar_metered)),
+        busbar_off=np.where(busbar.named, busbar.off, 0.0),
+    )
+    kinds = _kinds(design, state, tick, estimate, named)
+    answer = Verdict(
+        *verdict.verdict(front, given, estimate),
+        named,
+        evidence.score,
+        evidence.threshold,
+        _attack(design, state, tick, estimate, named),
+        inverters=np.zeros(front.plant.droop.tau.size, dtype=np.bool_),
+        inverter_attack=np.zeros(front.plant.droop.tau.size),
+        kinds=kinds.kinds,
+        explanations=rivals if suspected and len(rivals) > 1 else (),
+        unjudged=np.ones(front.plant.droop.tau.size, dtype=np.bool_),
+        busbar=given.busbar,
+        busbar_attack=given.busbar_off,
+    )
+    calm = not (suspected or any_of(named) or any_of(~busbar.trusted))
+    kept = (
+        record.kept(design.core.modes, state.kept, kernel.filter, kernel.static, now.ticks) if calm else None
+    )
+    learning = _gathered(design, trust, tick, suspected=suspected)
+    after = changed(
+        trust,
+        t=tick.measured.frame.t,
+        frame=tick.measured.frame,
+        since=tick.measured.frame.t if now.x is None else now.since,
+        ticks=now.ticks + 1,
+        x=tick.predicted.x,
+        model_driven=tick.predicted.model_driven,
+        injection_error=_injection_error(front, now, tick, trust.trust.trusted),
+        attack_kinds=kinds,
+        busbar=busbar,
+        learning=learning,
+        last=(estimate, answer),
+    )
+    out = replace(state, front=after, kept=kept or state.kept)
+    return (out if learning is None else _learned(design, out)), estimate, answer
+
+
+def _trust(
+    design: ModalDesign, now: SequentialState, named: Bools, suspicion: Suspicion | None
+) -> SequentialState:
+    """Front end that trusts all meters but those that are named or that a likely explanation accuses."""
+    trust, out = now.trust, named
+    if suspicion is not None:
+        out = named | verdict.accused(design.core, suspicion)
+    if np.array_equal(trust.named, named) and np.array_equal(trust.trusted, ~out):
+        return now
+    longest = len(design.front.lengths) - 1
+    return changed(
+        now,
+        trust=replace(
+            trust,
+            trusted=~out,
+            named=named,
+            scale=np.where(out, longest, trust.scale),
+            repeat_lag=np.where(named, trust.repeat_lag, 0),
+        ),
+    )
+
+
+def _injection_error(
+    front: SequentialDesign, now: SequentialState, tick: _Tick, trusted: Bools
+) -> front_state.InjectionError:
+    """Errors of the injections: unknown where a meter accused at this tick drove the inverter."""
+    new, error = now.trust.trusted & ~trusted, tick.predicted.injection_error
+    return error.reset((front.meter_of >= 0) & new[front.meter_of]) if any_of(new) else error
+
+
+def _settled(front: SequentialDesign, predicted: Prediction) -> bool:
+    """The observer's initial transient is a small part of the meters' accuracy."""
+    return all_of(predicted.transient <= front.options.settled * front.allowed)
+
+
+def _busbar(
+    design: ModalDesign, now: SequentialState, tick: _Tick, estimate: Estimate, variance: Floats
+) -> BusbarTrust:
+    """Trust of the busbar's meter: a named phase is compared with the estimate until both agree."""
+    if all_of(now.busbar.trusted):
+        return now.busbar
+    measured, front = tick.measured, design.front
+    there = measured.busbar_available & np.isfinite(variance)
+    v0_squared = estimate.v2_bus[front.plant.feeder.busbar_places()]
+    allowed = float(front.allowed.max())
+    return track_busbar(front, now.busbar, measured.busbar_reading, there, v0_squared, variance, allowed)
+
+
+def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Estimate, Floats]:
+    """Voltages by the model and the core, with standard deviation and bound; variance at the busbar, (b,)."""
+    front, kernel, measured = design.front, design.core, tick.measured
+    plant, now = front.plant, state.front
+    errors = core.estimate(kernel, state.core, state.suspicion)
+    mean, variance = errors.mean, errors.variance
+    whole = state.core.filter.full
+    if tick.unknown is not None and whole is not None:
+        u, read = tick.m - whole.mean[0] - whole.mean[1], whole.seen
+        if state.suspicion is not None:
+            # Readings and means without the suspected manipulations.
+            plain = core.estimate(kernel, state.core)
+            u = u - (mean - plain.mean)[front.prior.meters]
+            read = read & ~verdict.accused(kernel, state.suspicion)
+        more = doubts.estimated(kernel.modes, tick.unknown, u, read)
+        mean, variance = mean + more[0], variance + more[1]
+    v2_bus, first = tick.predicted.v2_bus + mean, plant.feeder.busbar_places()
+    v2_bus[first] = np.where(measured.busbar_metered, measured.v0_squared, v2_bus[first])
+    variance, of_busbar = variance.copy(), variance[first].copy()
+    variance[first] = np.maximum(variance[first], np.where(measured.busbar_metered, front.busbar**2, 0.0))
+    inputs = BoundInputs(
+        plant=plant,
+        powers=changed(tick.predicted.powers, trusted=now.trust.trusted),
+        injected=tick.predicted.injection_error.error,
+        model=tick.predicted.v2_bus[plant.feeder.bus],
+        busbar=measured.busbar_metered,
+        y=measured.y,
+        trusted=now.trust.trusted & measured.available,
+        checked=_Checked(front, measured.frame),
+        sigmas=front.sigmas[0],
+    )
+    made = BoundedEstimate.of(inputs, measured.frame.t, v2_bus, variance, tick.predicted.x)
+    return made, np.atleast_1d(of_busbar)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Checked:
+    """Meters with a known customer's power, (p,), evaluated with the bound."""
+
+    front: SequentialDesign
+    frame: Frame
+
+    def __call__(self) -> Bools:
+        return checked(self.front, self.frame)
+
+
+def own_errors(design: ModalDesign, state: CoreState) -> Floats:
+    """Posterior means of the meters' own fixed errors, (p,), squared pu.
+
+    Parameters
+    ----------
+    design, state
+        The design, and the state of the core.
+    """
+    whole, modes = state.filter.full, design.core.modes
+    if whole is not None:
+        return np.asarray(design.own @ whole.mean[1])
+    felt = modes.directions * (1.0 - state.static.signature[1])[:, None]
+    return np.asarray(design.own @ (modes.back @ (state.filter.mean[1] + felt @ state.static.theta)))
+
+
+def _attack(design: ModalDesign, state: ModalState, tick: _Tick, estimate: Estimate, named: Bools) -> Floats:
+    """Reconstructed manipulations: readings of named meters less own error and estimate, (p,)."""
+    if not any_of(named):
+        return np.zeros(named.size)
+    own = own_errors(design, state.core)
+    off = tick.measured.y - own - estimate.v2_bus[design.front.prior.meters]
+    return np.where(named & tick.measured.available, off, 0.0)
+
+
+def _kinds(
+    design: ModalDesign, state: ModalState, tick: _Tick, estimate: Estimate, named: Bools
+) -> AttackKinds:
+    """Kinds of the named manipulations."""
+    front, measured, kernel = design.front, tick.measured, state.core
+    references, meters = front.references, front.plant.meters
+    own = np.asarray(references.active * measured.frame.p[meters] + references.reactive * measured.q[meters])
+    expected = estimate.v2_bus[front.prior.meters]
+    variance = np.maximum(estimate.std[meters] ** 2 + front.white, front.white)
+    if any_of(named):
+        expected = expected + own_errors(design, kernel)
+        variance = verdict.deviations(design.core, kernel, tick.m)[1] ** 2
+    return classify(references, state.front.attack_kinds, expected, own, named, variance)
+
+
+# --- Commissioning ---
+
+
+def _gathered(design: ModalDesign, now: SequentialState, tick: _Tick, *, suspected: bool) -> Learning | None:
+    """Time of commissioning after a tick; the errors themselves are states of the filter."""
+    learning, front = now.learning, design.front
+    if learning is None or not now.ticks:
+        return learning
+    frame, available = tick.measured.frame, tick.measured.available
+    state = LearningTick(frame, available, now.trust.trusted, suspected, now.uncertainty)
+    use, why = usable(front, learning, state)
+    h = frame.t - now.t
+    h = h if h <= PAUSE * front.step_s else front.step_s
+    return gather(learning, tick.m, use, h, why)
+
+
+def _learned(design: ModalDesign, state: ModalState) -> ModalState:
+    """State with the errors of meters that have been read for the time of commissioning."""
+    front, now = design.front, state.front
+    gathered = now.learning
+    if gathered is None or any_of(state.core.detector.pinned):
+        return state
+    done = ready_meters(front, gathered) & gathered.open & now.trust.trusted & (gathered.count > 0)
+    if not any_of(done):
+        return state
+    rest = gathered.open & ~done
+    left = None
+    if any_of(rest):
+        left = replace(gathered, since=np.where(rest, gathered.since, np.nan))
+    return replace(state, front=changed(now, learned=_errors(design, state, done), learning=left))
+
+
+def _errors(design: ModalDesign, state: ModalState, done: Bools) -> Learned:
+    """Fixed errors of the filter, for the meters `done` (p,)."""
+    front, modes, known, kernel = design.front, design.core.modes, state.front.learned, state.core
+    whole = kernel.filter.full or full.expanded(modes, kernel.filter, kernel.static)
+    B, P = modes.covariance_b, whole.cov[modes.size :, modes.size :]
+    fixed = design.core.model.fixed
+    variance = np.clip(fixed - ((design.own @ (B - P)) * design.own).sum(axis=1), 0.0, front.fixed)
+    aging = front.options.stability * (front.allowed - front.rounded)
+    allowed = np.minimum(aging + 3.0 * np.sqrt(variance) + front.rounded, front.allowed)
+    bias = np.clip(own_errors(design, kernel), -front.allowed, front.allowed)
+    return Learned(
+        bias=np.where(done, bias, known.bias),
+        variance=np.where(done, variance, known.variance),
+        allowed=np.where(done, allowed, known.allowed),
+        at=np.where(done, state.front.t, known.at),
+        hidden=known.hidden,
+    )
+
+
+def renew(design: ModalDesign, state: ModalState, which: Bools) -> ModalState:
+    """State after meters `which` (p,) were replaced: trusted again, with their errors to be learned.
+
+    With K of `ModalDesign.own`, a meter's own error is ``K b + r``, r independent of readings. A new error
+    in its place gives, with A the identity less the rows K of the replaced meters,
+
+        b <- A b,   cov b <- A cov b A' + 2 diag(fixed) - K B K'     in their rows and columns.
+
+    The evidence of all onsets is given up.
+    """
+    front, modes, kernel = design.front, design.core.modes, state.core
+    known = meter_bias.renew(
+        front, Commission(state.front.learned, state.front.learning), which, state.front.t
+    )
+    whole = kernel.filter.full or full.expanded(modes, kernel.filter, kernel.static)
+    t, at = modes.size, np.flatnonzero(which)
+    A, K = np.eye(2 * t), design.own[at]
+    A[t + at, t:] -= K
+    cov, fixed = A @ whole.cov @ A.T, design.core.model.fixed[at]
+    cov[np.ix_(t + at, t + at)] += 2.0 * np.diag(fixed) - K @ modes.covariance_b @ K.T
+    mean = (A @ whole.mean.ravel()).reshape(2, t)
+    blank = core.init(design.core, kernel.filter.t)
+    opened = replace(kernel.filter, full=replace(whole, mean=mean, cov=cov, complete=0))
+    parts = opened, kernel.static, blank.detector
+    masked = masking.Masked(
+        kernel.masked.meters & ~which,
+        np.where(which, 0, kernel.masked.count),
+        np.where(which, 0.0, kernel.masked.total),
+    )
+    begun = replace(
+        blank,
+        filter=opened,
+        static=kernel.static,
+        update=kernel.update,
+        history=replace(blank.history, start=(*parts, ())),
+        masked=masked,
+    )
+    kinds = state.front.attack_kinds
+    now = changed(
+        state.front,
+        learned=known.learned,
+        learning=known.learning,
+        attack_kinds=replace(kinds, history=forget_readings(kinds.history, which)),
+        trust=state.front.trust.replaced(which),
+    )
+    zero = 0 * state.streak
+    return ModalState(now, begun, None, zero, 0 * state.phases, 0, record.made(modes, opened, kernel.static))
+
+
+def progress(design: ModalDesign, commission: Commission) -> LearningProgress:
+    """State and reason of each meter's learning."""
+    return meter_bias.progress(design.front, commission)
+
+
+def to_arrays(design: ModalDesign, commission: Commission) -> dict[str, Floats]:
+    """Persistent form of a commissioning: arrays of p numbers by name."""
+    kept = commission.kept if isinstance(commission, ModalCommission) else None
+    return meter_bias.to_arrays(commission) | record.to_arrays(design.core.modes, kept)
+
+
+def from_arrays(design: ModalDesign, arrays: Mapping[str, Floats]) -> ModalCommission:
+    """Commissioning from the arrays of `to_arrays`.
+
+    Raises
+    ------
+    ValueError
+        If the arrays do not fit the design; the message names every problem.
+    """
+    rest = {name: values for name, values in arrays.items() if not record.is_own(name)}
+    known = meter_bias.from_arrays(design.front, rest)
+    return ModalCommission(known.learned, known.learning, record.from_arrays(design.core.modes, arrays))
+
+
+# --- Suspects over a restart ---
+
+
+def distrusted(design: ModalDesign, state: ModalState) -> SuspicionRecord:
+    """Suspects of a state after a tick."""
+    return front_state.distrusted(design.front, state.front)
+
+
+def warm_start(design: ModalDesign, state: ModalState, before: SuspicionRecord) -> ModalState:
+    """State from `init` with the named meters of an earlier run: masked from the first reading on."""
+    before = replace(before, scale_s=np.where(before.named, before.scale_s, np.nan))
+    if before.is_empty:
+        return state
+    front = front_state.warm_start(design.front, state.front, before)
+    return replace(
+        state,
+        front=front,
+        core=replace(state.core, masked=masking.added(state.core.masked, ~front.trust.trusted)),
+    )

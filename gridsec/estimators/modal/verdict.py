@@ -1,0 +1,400 @@
+"""Answer of one tick: evidence of each meter, verdict with its reason, explanations.
+
+**Score and threshold.** The detector sums over onsets and faults. The part of one meter at the likeliest
+onset alone reaches the limit at
+
+    s^2 y^2 / (2 (1 + s^2 F)) - log(1 + s^2 F) / 2 >= log gamma - log(weight capital / p),
+
+y and F being its score and its information. The score shown is the amount ``|y| / F``, the threshold the
+amount at equality. The sum may reach the limit before any of its parts does. For a masked meter the score is
+the distance of its reading from the filter without it, the threshold that of the release.
+
+**Decision.** ATTACKED: a meter is named, or the busbar's. UNDECIDED: log M was beyond the limit since the
+suspected onset, and no meter is named; too few meters; unread powers that leave a voltage too uncertain.
+CLEAN: none of these.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import log
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, all_of, any_of, indices
+from gridsec.estimators.detection import DecisionInputs, decide
+from gridsec.estimators.modal import masking, signatures
+from gridsec.estimators.modal.core import Core, CoreState, Suspicion
+from gridsec.estimators.modal.detector import SIZE, WEIGHTS, Evidence
+from gridsec.estimators.modal.search import amounts
+from gridsec.estimators.plant import NO_VOLTAGE
+from gridsec.estimators.sequential.design import SequentialDesign
+from gridsec.estimators.sequential.measurements import largest_offset, unusable_offsets
+from gridsec.estimators.sequential.output import (
+    busbar_deviation,
+    clock_sentence,
+    explanations_sentence,
+    fault_sentence,
+    unread_sentence,
+)
+from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame
+
+LIKELY = 0.01
+"""Weight from which on an explanation is reported, 1."""
+SHOWN = 20
+"""Largest number of reported explanations."""
+ALONE = 1e-3
+"""Weight of all explanations without the busbar's meter below which it is named, 1: as `search.DOUBT`."""
+LEAST_PRECISION = 1e-6
+"""Least precision of a reading, 1 / squared pu^2: below it nothing is known of a voltage."""
+LEAST_V2 = 1e-2
+"""Least squared voltage that relates a standard deviation to the voltage, pu."""
+
+Finding = tuple[Decision, Cause, str]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeterEvidence:
+    """Evidence of the meters. p meters.
+
+    Attributes
+    ----------
+    score, threshold : (p,)
+        As in `gridsec.interface.Verdict`.
+    tested : (p,)
+        Meters that a single reading would show within the widest threshold.
+    row
+        Row of the onset in the detector.
+    """
+
+    score: Floats
+    threshold: Floats
+    tested: Bools
+    row: int
+
+
+def meter_evidence(  # noqa: PLR0917  # the core, one tick, and one limit
+    core: Core,
+    state: CoreState,
+    evidence: Evidence,
+    now: tuple[Floats, Bools],
+    widest: float,
+    suspicion: Suspicion | None,
+) -> MeterEvidence:
+    """Evidence of every meter at the likeliest onset.
+
+    Parameters
+    ----------
+    core, state, evidence
+        The core, the state after a tick, and the answer of that tick.
+    now : (p,), (p,)
+        Residuals and meters with a reading.
+    widest
+        Widest threshold, squared pu.
+    suspicion
+        The explanations, if there are any.
+    """
+    made, test, (m, seen) = core.modes, state.detector, now
+    row = _row(state, evidence, suspicion)
+    one = signatures.scores(made, test.onsets, state.static, np.array([row]))
+    y, F = (each[0] for each in one.of(made.U.T, made.squares.T))
+    F = np.maximum(F, np.finfo(np.float64).tiny)
+    part = log(WEIGHTS[0] / made.size) + float(test.capital[0, row])
+    gain = 2.0 * (core.limit - part) + np.log1p(SIZE**2 * F)
+    least = np.sqrt(np.maximum(gain, 0.0) * (1.0 + SIZE**2 * F)) / (SIZE * F)
+    score, threshold = np.where(seen, np.abs(y) / F, np.nan), np.minimum(least, NO_VOLTAGE)
+    update = state.update
+    if update is not None and update.exact is not None:
+        precision = update.exact.precision
+    elif update is not None:
+        precision = made.squares @ (1.0 / update.variance)
+    else:
+        precision = np.zeros(made.size)
+    alone = np.sqrt(2.0 * core.limit / np.maximum(precision, LEAST_PRECISION))
+    tested, full = seen & (alone <= widest), state.filter.full
+    if update is not None and update.seen is not None:
+        # A meter released at this tick was not read.
+        tested = tested | (seen & ~update.seen)
+    if any_of(state.masked.meters) and full is not None:
+        out = state.masked.meters
+        off, std = deviations(core, state, m)
+        score = np.where(out & seen, np.abs(off), score)
+        threshold = np.where(out, masking.OUTLIER * std, threshold)
+        tested = tested | (out & seen)
+    return MeterEvidence(score, threshold, tested, row)
+
+
+def deviations(core: Core, state: CoreState, m: Floats) -> tuple[Floats, Floats]:
+    """Deviation of every reading from the filter, and its standard deviation for a meter that is not read.
+
+    Parameters
+    ----------
+    core, state
+        The core, and the state after a tick.
+    m : (p,)
+        Residuals.
+    """
+    full, made = state.filter.full, core.modes
+    t = made.size
+    if full is None:
+        felt = 1.0 - state.static.signature[0] - state.static.signature[1]
+        spread = made.back @ (felt[:, None] * made.directions)
+        mean = made.back @ state.filter.mean.sum(axis=0) + spread @ state.static.theta
+        P = state.filter.cov
+        variance = (made.back * made.back) @ (P[0] + 2.0 * P[1] + P[2] + 1.0)
+        variance += np.einsum("jr,rs,js->j", spread, state.static.cov, spread)
+        return m - mean, np.sqrt(variance)
+    P = full.cov
+    slow = np.diag(P[:t, :t]) + 2.0 * np.diag(P[:t, t:]) + np.diag(P[t:, t:])
+    return m - full.mean[0] - full.mean[1], np.sqrt(slow + made.noise.diagonal())
+
+
+def _row(state: CoreState, evidence: Evidence, suspicion: Suspicion | None) -> int:
+    """Row of the onset that is shown: the suspected one, the likeliest one, else the oldest one."""
+    onsets = state.detector.onsets
+    if suspicion is not None and onsets.used[suspicion.row]:
+        return suspicion.row
+    of_meters = np.where(onsets.used, evidence.by_row[0], -np.inf)
+    if np.isfinite(of_meters).any():
+        return int(of_meters.argmax())
+    return int(np.where(onsets.used & ~onsets.ramp, onsets.age, -1).argmax())
+
+
+# --- Explanations ---
+
+
+def explanations(
+    design: SequentialDesign, core: Core, suspicion: Suspicion | None
+) -> tuple[Explanation, ...]:
+    """Reported explanations, the likeliest first; sets that differ in the loads only are one.
+
+    Parameters
+    ----------
+    design, core
+        The front end, and the core.
+    suspicion
+        The explanations.
+    """
+    if suspicion is None:
+        return ()
+    found, p, inverters = suspicion.found, core.modes.size, design.plant.droop.tau.size
+    total: dict[bytes, float] = {}
+    for chosen, weight in zip(found.chosen, found.weight, strict=True):
+        key = chosen.tobytes()
+        total[key] = total.get(key, 0.0) + float(weight)
+    likely = sorted(((w, key) for key, w in total.items() if w >= LIKELY), key=lambda each: -each[0])
+    powers, phases = core.faults.powers, design.busbar_incidence.shape[1]
+    used = core.model.phases(core.modes.at).any(axis=0)
+    out = []
+    for weight, key in likely[:SHOWN]:
+        chosen = np.frombuffer(key, dtype=np.bool_)
+        busbar = np.zeros(phases, dtype=np.bool_)
+        busbar[used] = chosen[p + powers :]
+        out.append(
+            Explanation(
+                chosen[:p].copy(),
+                np.zeros(inverters, dtype=np.bool_),
+                weight,
+                chosen[p : p + powers].copy(),
+                busbar,
+            )
+        )
+    return tuple(out)
+
+
+def accused(core: Core, suspicion: Suspicion) -> Bools:
+    """Meters that a likely explanation accuses, (p,)."""
+    found = suspicion.found
+    return np.asarray(found.chosen[found.weight >= LIKELY, : core.modes.size].any(axis=0))
+
+
+def certain_phases(core: Core, suspicion: Suspicion) -> Bools:
+    """Phases of the busbar without which nothing explains the readings, (b,); b counts those with a meter.
+
+    Parameters
+    ----------
+    core, suspicion
+        The core, and the explanations.
+    """
+    found, first = suspicion.found, core.modes.size + core.faults.powers
+    return np.asarray(found.weight @ ~found.chosen[:, first:] < ALONE)
+
+
+# --- Verdict ---
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inputs:
+    """Inputs of a verdict. p meters, b phases of the busbar.
+
+    Attributes
+    ----------
+    frame
+        The frame.
+    seen, named, unread : (p,)
+        Meters with a reading, named ones, and those with a reading that no known power checks.
+    evidence
+        Evidence of the meters.
+    suspected
+        log M was beyond its limit since the suspected onset.
+    explanations, suspicion
+        What explains it.
+    settled
+        The observer of the inverters has settled.
+    busbar, metered : (b,)
+        Phases with a meter named as manipulated, and with a busbar voltage in use.
+    busbar_off : (b,)
+        Excess of the reading of a named phase, squared pu.
+    """
+
+    frame: Frame
+    seen: Bools
+    named: Bools
+    unread: Bools
+    evidence: MeterEvidence
+    suspected: bool
+    explanations: tuple[Explanation, ...]
+    suspicion: Suspicion | None = field(repr=False)
+    settled: bool
+    busbar: Bools
+    metered: Bools
+    busbar_off: Floats
+
+
+def verdict(design: SequentialDesign, now: Inputs, estimate: Estimate) -> Finding:
+    """Decision, cause and sentence.
+
+    Parameters
+    ----------
+    design
+        The front end.
+    now
+        Inputs.
+    estimate
+        The estimate of the tick.
+    """
+    tested = now.seen
+    live = int(np.count_nonzero(tested))
+    finding = decide(
+        DecisionInputs(
+            names=design.names,
+            max_attacked=max(1, min(design.max_attacked, live // 3)),
+            live=tested,
+            suspected=np.zeros_like(now.named),
+            named=now.named,
+            wide=tested & ~(now.evidence.tested | now.unread),
+            valid=True,
+            settled=now.settled,
+            busbar=True,
+        )
+    )
+    finding = _unvouched(design, now, tested, finding)
+    finding = _busbar(design, now, estimate, finding)
+    if now.suspected:
+        finding = _suspected(design, now, finding)
+    return _clock(design, now, tested, _unread_powers(design, now, estimate, finding))
+
+
+def _unvouched(design: SequentialDesign, now: Inputs, tested: Bools, finding: Finding) -> Finding:
+    """UNDECIDED where too few meters report from a phase without a busbar voltage."""
+    if finding[0] is not Decision.CLEAN or all_of(now.metered):
+        return finding
+    count = (design.busbar_incidence > 0.0)[tested].sum(axis=0)
+    least = int(np.where(now.metered, tested.size, count).min())
+    most = max(1, min(design.max_attacked, int(tested.sum()) // 3))
+    if least > 2 * most:
+        return finding
+    sentence = (
+        f"The busbar voltage of a phase is missing, and {least} meters report from there; "
+        f"at least {2 * most + 1} are needed to tell {most} manipulated from the others."
+    )
+    return Decision.UNDECIDED, Cause.TOO_FEW_METERS, sentence
+
+
+def _busbar(design: SequentialDesign, now: Inputs, estimate: Estimate, finding: Finding) -> Finding:
+    """ATTACKED where the busbar's meter is named."""
+    decision, cause, reason = finding
+    if not any_of(now.busbar) or cause not in (
+        Cause.AGREEMENT,
+        Cause.RESIDUALS,
+        Cause.SILENT_METERS,
+        Cause.TOO_FEW_METERS,
+    ):
+        return finding
+    v0 = estimate.v2_bus[design.plant.feeder.busbar_places()]
+    off = busbar_deviation(now.busbar_off, v0, now.busbar)
+    if cause is Cause.RESIDUALS:
+        return decision, cause, f"{reason[:-1]}; and the meter of the busbar."
+    return Decision.ATTACKED, Cause.RESIDUALS, f"Manipulated: the meter of the busbar; it {off}."
+
+
+def _suspected(design: SequentialDesign, now: Inputs, finding: Finding) -> Finding:
+    """UNDECIDED where the readings disagree and no meter is named; a sentence more where one is."""
+    decision, cause, reason = finding
+    if decision is Decision.ATTACKED:
+        return decision, cause, f"{reason} The other meters, taken together, still disagree with the feeder."
+    if cause not in (Cause.AGREEMENT, Cause.SILENT_METERS, Cause.SETTLING):
+        return finding
+    some = tuple(each for each in now.explanations if _accuses(each))
+    if not some:
+        sentence = "The meters, taken together, disagree with the feeder by more than chance."
+        return Decision.UNDECIDED, Cause.MISFIT, sentence
+    if (
+        len(some) == 1
+        and not some[0].meters.any()
+        and some[0].powers.sum() == 1
+        and now.suspicion is not None
+    ):
+        sentence = _one_power(design, now.suspicion, some[0])
+        if sentence:
+            return Decision.UNDECIDED, Cause.AMBIGUOUS, sentence
+    if len(some) == 1:
+        parts = explanations_sentence(design, some).removesuffix("; nothing else explains the readings.")
+        return Decision.UNDECIDED, Cause.AMBIGUOUS, f"{parts}, or loads that no reading shows."
+    return Decision.UNDECIDED, Cause.AMBIGUOUS, explanations_sentence(design, some)
+
+
+def _accuses(explanation: Explanation) -> bool:
+    return any_of(explanation.meters) or any_of(explanation.powers) or any_of(explanation.busbar)
+
+
+def _one_power(design: SequentialDesign, suspicion: Suspicion, one: Explanation) -> str:
+    """Sentence about a single wrong power; empty where its amount is unknown."""
+    found, customer = suspicion.found, int(np.flatnonzero(one.powers)[0])
+    p = one.meters.size
+    for chosen, model in zip(found.chosen, found.model, strict=True):
+        at = np.flatnonzero(chosen)
+        if at.size == 1 and at[0] == p + customer:
+            mean, _ = amounts(found.problems[int(model)], chosen)
+            # A missing injection lowers the voltages: the residual is that of the true power.
+            return fault_sentence(design, customer, float(mean[0]))
+    return ""
+
+
+def _unread_powers(design: SequentialDesign, now: Inputs, estimate: Estimate, finding: Finding) -> Finding:
+    """UNDECIDED where a voltage beside an unread power is too uncertain."""
+    unread = now.unread & now.seen
+    if finding[1] not in (Cause.AGREEMENT, Cause.SILENT_METERS) or not any_of(unread):
+        return finding
+    at, limit = design.plant.meters, design.options.unread_std_percent
+    v = np.sqrt(np.maximum(estimate.v2[at], LEAST_V2))
+    percent = 50.0 * estimate.std[at] / (v * design.plant.droop.vbar)
+    wide = unread & ~(percent <= limit)
+    if not any_of(wide):
+        return finding
+    frame = now.frame
+    origins = np.zeros(frame.p.size, dtype=np.intp) if frame.p_origin is None else frame.p_origin
+    sentence = unread_sentence(design.names, wide, origins[at], percent, limit)
+    return Decision.UNDECIDED, Cause.MISSING_POWERS, sentence
+
+
+def _clock(design: SequentialDesign, now: Inputs, tested: Bools, finding: Finding) -> Finding:
+    """The meters that count as silent for a clock offset beyond every scale, in the sentence."""
+    decision, cause, reason = finding
+    far = unusable_offsets(design, now.frame.clock_offset)
+    if far is None or cause not in (Cause.SILENT_METERS, Cause.TOO_FEW_METERS):
+        return finding
+    sentence = clock_sentence(design.names, far, largest_offset(design))
+    if cause is Cause.SILENT_METERS and not indices(~tested & ~far).size:
+        return decision, Cause.CLOCK_OFFSET, sentence
+    return decision, cause, f"{reason} {sentence}"
