@@ -108,7 +108,7 @@ class CoreState:
     masked
         Masked meters.
     rivals
-        The model and its rivals since the start of the kept readings, with the likeliest of the pinned onsets.
+        The model and its rivals since the start of the kept readings, with the likeliest pinned onset.
     """
 
     filter: FilterState
@@ -442,9 +442,7 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     now = _joint(core, _parts(state), suspicion.row)
     before, T = [plain], [estimates.moves(made, by, state.filter, now, core.faults.W, core.effect)]
     for each in state.rivals[1:]:
-        assert each.update is not None
-        before.append(
-            estimates.honest(each.modes, by, each.filter, each.static, each.update, loads=each.loads)
-        )
+        update = each.update or state.update
+        before.append(estimates.honest(each.modes, by, each.filter, each.static, update, loads=each.loads))
         T.append(estimates.moves(each.modes, by, each.filter, each.joint(), core.faults.W, core.effect))
     return estimates.corrected(before, T, suspicion.found)
