@@ -24,7 +24,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from fastapi.staticfiles import StaticFiles
-from pydantic import TypeAdapter
+from pydantic import StringConstraints, TypeAdapter
 from starlette.middleware.gzip import GZipMiddleware
 
 from gridsec.errors import FeederInvalid, GridsecError, Problem
@@ -39,6 +39,7 @@ from service.errors import FeederNotLoaded, FeederUnknown
 from service.report.report import BUSBAR, FeederReport
 from service.settings import is_loopback
 from service.store import AlarmEvent, Store, StoreUnavailable
+from service.store.series import LONGEST_S
 
 
 class Backend(Protocol):
@@ -511,6 +512,69 @@ def get_history(
     if media != tables.JSON:
         return _as_table(response, tables.encoded(tables.history(rows, meter), media), media)
     return {"feeder": feeder, "points": rows, "more": more}
+
+
+MAX_SERIES = 12
+"""Largest number of meters of one time series."""
+MAX_BUCKETS = 2000
+"""Largest number of buckets of one time series."""
+
+
+@_feeders.get("/{feeder}/series", response_model=models.Series, responses=_TABLES)
+def get_series(
+    request: Request,
+    response: Response,
+    backend: BackendHere,
+    feeder: KnownFeeder,
+    media: Media,
+    *,
+    meter: Annotated[
+        list[Annotated[str, StringConstraints(pattern=_NAME)]],
+        Query(min_length=1, max_length=MAX_SERIES, description="Meters; may be repeated."),
+    ],
+    since: Since = None,
+    until: Until = None,
+    buckets: Annotated[
+        int, Query(ge=1, le=MAX_BUCKETS, description="Largest number of buckets; the ends may add one.")
+    ] = 600,
+) -> Any:
+    """Minimum and maximum of reported and estimated voltages and of the uncertainty band, by bucket.
+
+    Without `until` the series ends with the latest tick, without `since` it covers one hour. The longest one
+    covers 15 days. Tables have a row for each bucket and meter, and no alarms.
+    """
+    if until is None:
+        report = backend.report(feeder)
+        newest = backend.store.history(feeder, limit=1) if report is None else []
+        last = report.t if report is not None else newest[0]["t"] if newest else 0.0
+        until = last + 1.0
+    since = until - 3600.0 if since is None else since
+    if not 0.0 < until - since <= LONGEST_S:
+        text = f"must be before until, by at most {LONGEST_S:g} s"
+        raise RequestValidationError([{"loc": ("query", "since"), "msg": text, "type": "time"}])
+    wanted = list(dict.fromkeys(meter))
+    for one in wanted:
+        if not _has(backend, feeder, one):
+            raise HTTPException(404, f"feeder {feeder!r} has no meter {one!r}")
+    found = tables.series(backend.store.series(feeder, wanted, since=since, until=until, buckets=buckets))
+    _link(request, response, media)
+    response.headers["Cache-Control"] = "no-store"
+    if media != tables.JSON:
+        return _as_table(response, tables.encoded(tables.series_table(found), media), media)
+    spans, more = backend.store.alarm_spans(feeder, since=since, until=until)
+    alarms = [
+        {
+            "id": span.alarm.id,
+            "kind": span.alarm.kind,
+            "meter": span.alarm.meter,
+            "customer": span.alarm.customer,
+            "severity": span.alarm.severity,
+            "t_raised": span.raised,
+            "t_cleared": span.cleared,
+        }
+        for span in spans
+    ]
+    return {"feeder": feeder, **found, "alarms": alarms, "more_alarms": more}
 
 
 def _has(backend: Backend, feeder: str, meter: str) -> bool:
