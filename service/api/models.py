@@ -110,6 +110,12 @@ class FeederSummary(BaseModel):
     verdict: Decision | None = None
     model_only: bool | None = Field(default=None, description="As in the state; null before the first tick.")
     since: float | None = Field(default=None, description="First consecutive tick with this verdict, Unix s.")
+    displayed_verdict: Decision | None = Field(
+        default=None, description="Verdict after the delays of the alarms; null before the first tick."
+    )
+    displayed_since: float | None = Field(
+        default=None, description="First tick of the time that led to it, Unix s."
+    )
     meters: int = Field(default=0, description="Number of meters at the latest tick.")
     suspects: int = Field(default=0, description="Meters and inverters named as manipulated at that tick.")
     silent: int = Field(default=0, description="Silent meters of customers at that tick.")

@@ -409,6 +409,8 @@ def _summary(backend: Backend, fields: dict[str, Any], raised: int) -> models.Fe
             "age_s": backend.age(report),
             "model_only": report.model_only,
             "since": report.since,
+            "displayed_verdict": None if report.displayed is None else report.displayed.verdict,
+            "displayed_since": None if report.displayed is None else report.displayed.since,
             "meters": len(report.meters),
             "suspects": len(report.suspects) + sum(inverter.suspect for inverter in report.inverters),
             "silent": sum(one.meter != BUSBAR for one in report.silent),
@@ -529,9 +531,9 @@ def get_series(
     media: Media,
     *,
     meter: Annotated[
-        list[Annotated[str, StringConstraints(pattern=_NAME)]],
-        Query(min_length=1, max_length=MAX_SERIES, description="Meters; may be repeated."),
-    ],
+        list[Annotated[str, StringConstraints(pattern=_NAME)]] | None,
+        Query(max_length=MAX_SERIES, description="May be repeated. Without: verdicts and alarms only."),
+    ] = None,
     since: Since = None,
     until: Until = None,
     buckets: Annotated[
@@ -552,7 +554,7 @@ def get_series(
     if not 0.0 < until - since <= LONGEST_S:
         text = f"must be before until, by at most {LONGEST_S:g} s"
         raise RequestValidationError([{"loc": ("query", "since"), "msg": text, "type": "time"}])
-    wanted = list(dict.fromkeys(meter))
+    wanted = list(dict.fromkeys(meter or ()))
     for one in wanted:
         if not _has(backend, feeder, one):
             raise HTTPException(404, f"feeder {feeder!r} has no meter {one!r}")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
@@ -136,7 +137,7 @@ def series(found: Series) -> dict[str, Any]:
 
 def _volts(values: Any) -> list[float | None]:
     """Return voltages of single precision to a millivolt, or at 10 kV and above to 10 mV; None for NaN."""
-    return [None if v != v else round(v, 3 if abs(v) < 1e4 else 2) for v in values.tolist()]
+    return [round(v, 3 if abs(v) < 1e4 else 2) if math.isfinite(v) else None for v in values.tolist()]
 
 
 def series_table(fields: Mapping[str, Any]) -> pa.Table:

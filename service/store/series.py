@@ -243,6 +243,7 @@ def of_rows(
             part = data[first : first + _AT_ONCE]
             _decode(part, meters, wanted, columns[at : at + len(part)], flags[at : at + len(part)])
             at += len(part)
+    columns[~np.isfinite(columns)] = math.nan
     estimated = np.where(flags & _MODEL_ONLY, np.float32(math.nan), columns[:, _ESTIMATED])
     half = np.float32(BAND_STD) * columns[:, _STD]
     reported = columns[:, _REPORTED]
