@@ -3,8 +3,8 @@
     python -m benchmarks.series
 
 Rows are stored every 10 s. The request is that of the page: six meters, 720 buckets, over HTTP. Times are
-processor times of service and client, median of five. Limits: 14 days take at most 1 s, and roll-ups at most a
-fifth of the size of the rows.
+processor times of service and client, median of five. Limits: 14 days take at most 1 s, and roll-ups at most
+a fifth of the size of the rows.
 """
 
 from __future__ import annotations
@@ -38,9 +38,7 @@ def a_report(t: float, draw: np.random.Generator) -> FeederReport:
     std = 0.15 + 0.01 * draw.random(METERS)
     numbers = (score, np.full(METERS, 2e-3), reported, v, std)
     meters = tuple(
-        MeterState(
-            f"m{k}", "b", True, False, *map(float, (score[k], 2e-3, reported[k], v[k], std[k])), 1.0, 0.0
-        )
+        MeterState(f"m{k}", "b", True, False, *(float(n[k]) for n in numbers), 1.0, 0.0)
         for k in range(METERS)
     )
     return FeederReport("village", t, Decision.CLEAN, "", Cause.AGREEMENT, 2, meters, (), (), 207.0, 253.0)

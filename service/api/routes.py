@@ -30,7 +30,7 @@ from starlette.middleware.gzip import GZipMiddleware
 from gridsec.errors import FeederInvalid, GridsecError, Problem
 from service.access.identity import OPEN, POLICY, PUBLIC, Identity, NotPermitted, Role
 from service.alarms.state_machine import Alarm, AlarmKind, AlarmState, AlarmUnknown, Severity
-from service.api import models, tables
+from service.api import guide, models, tables
 from service.api.access import COOKIE, FRESH_S, Authenticator, authorise, client_of, session_of
 from service.api.description import BODY, TAGS, feeder_schemas
 from service.api.errors import Guard, HeadAsGet, handlers, problem
@@ -215,6 +215,7 @@ def create_api(
     app.include_router(_alarms)
     app.include_router(_operations)
     app.include_router(_sessions)
+    app.add_route(guide.ADDRESS, guide.show, include_in_schema=False)
     app.mount("/", _Web(directory=_WEB, html=True), name="web")
     _describe(app)
     app.state.queries = _queries(app.openapi())
