@@ -8,7 +8,7 @@ const BUSBAR = "substation";
 const MOST = 6; // Meters in one chart.
 const SPANS = [[3600, "1 h"], [21600, "6 h"], [86400, "24 h"], [604800, "7 d"], [1209600, "14 d"]];
 const [SHORTEST_S, LONGEST_S] = [60, 1209600];
-const [LEFT, RIGHT, LANE, ROW, GAP, AXIS] = [70, 12, 11, 9, 14, 34]; // Margins and heights, px.
+const [LEFT, RIGHT, LANE, ROW, GAP, AXIS] = [70, 12, 11, 9, 14, 22]; // Margins and heights, px.
 const ALARM_ROWS = 4;
 const TABLE_ROWS = 24; // Times in the table.
 const STEPS_S = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400, 172800, 604800];
@@ -127,6 +127,7 @@ export class Series {
     this.feeder = null;
     this.report = null;
     this.turn = 0;
+    this.pointer = null; // Its place over the chart.
     this.close({ quiet: true });
     byId("series-spans").replaceChildren(...SPANS.map(([s, text]) =>
       el("button", { type: "button", "data-span": s, text, on: { click: () => this.choose(s) } })));
@@ -384,9 +385,10 @@ export class Series {
     ];
     Object.assign(this, { cursor, chosenBox: chosen, tip });
     this.chart.replaceChildren(drawing, tip);
+    if (this.pointer) this.readout(this.pointer);
     const left = data.complete ? "" : " Older ticks are left out.";
     const none = data.t.length ? "" : " No stored ticks in this time.";
-    byId("series-state").textContent = `${moment(data.from)} to ${moment(data.to)}, local time${this.until === null ? ", following" : ""}; ${duration(data.bucket_s)} per point.${none}${left}`;
+    byId("series-state").textContent = `${moment(data.from)} to ${moment(data.to)}, local time${this.until === null ? ", following" : ""}; ${duration(Math.max(data.bucket_s, data.step_s))} per point.${none}${left}`;
   }
 
   // Verdicts, one row each, and alarms.
@@ -462,12 +464,12 @@ export class Series {
   }
 
   axis(x, { top, bottom, right }) {
-    const { found, step } = times(this.data.from, this.data.to, Math.max(2, Math.floor((right - LEFT) / 90)));
+    const { found, step } = times(this.data.from, this.data.to, Math.max(2, Math.floor((right - LEFT) / 64)));
     return [
       ...found.flatMap((t) => [
         svg("line", { class: "grid", x1: x(t), x2: x(t), y1: top, y2: bottom + 4 }),
-        svg("text", { class: "axis", x: x(t), y: bottom + 17, "text-anchor": "middle", text: labelOf(t, step) })]),
-      svg("text", { class: "axis", x: right, y: bottom + 31, "text-anchor": "end", text: "local time" }),
+        svg("text", { class: "axis", x: Math.min(x(t), right + RIGHT - 20), y: bottom + 17, "text-anchor": "middle", text: labelOf(t, step) })]),
+      svg("text", { class: "axis", x: LEFT - 22, y: bottom + 17, "text-anchor": "end", text: "local" }),
     ];
   }
 
@@ -493,7 +495,8 @@ export class Series {
       const [a, b] = [drag.t, this.time(event)].sort((p, q) => p - q).map(this.x);
       for (const [name, value] of Object.entries({ x: a, width: b - a, visibility: "visible" })) this.chosenBox.setAttribute(name, value);
     }
-    this.readout(event);
+    this.pointer = { clientX: event.clientX, clientY: event.clientY };
+    this.readout(this.pointer);
   }
 
   release(event) {
@@ -510,6 +513,7 @@ export class Series {
   }
 
   unpoint() {
+    this.pointer = null;
     this.cursor?.setAttribute("visibility", "hidden");
     if (this.tip) this.tip.hidden = true;
   }

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from feeders.model.site import load
+from feeders.simulation.plant import Channel
+from feeders.simulation.recording import read_recording, record
+from feeders.simulation.scenario import Scenario
 from gridsec.interface import Cause, Decision
 from service.alarms.displayed import Display, advance
 from service.alarms.state_machine import AlarmBook, AlarmKind, AlarmRules, conditions
 from service.alarms.state_machine import advance as advance_alarms
+from service.engine.replay import ReplayCounts, replay
 from service.report.report import FeederReport
 from tests.service.stored import T0, a_report
 
@@ -109,3 +116,16 @@ def test_no_answer_never_stays_behind_another_verdict(sequence: str) -> None:
     assert all(b - a > RULES.on_delay_s for a, b in pairwise(changes))
     for k in changes:
         assert {"S": "U"}.get(every[k], every[k]) == found[k]
+
+
+@pytest.mark.acceptance
+def test_lost_readings_of_a_real_feeder(tmp_path: Path) -> None:
+    """With a fifth of the readings lost the raw verdict flickers, the displayed one does not."""
+    site = load("simbench-lv-rural1")
+    recording = record(site, Scenario(duration_s=300.0, channel=Channel(loss=0.2)), tmp_path / "day.parquet")
+    found = [one.report for one in replay(site, read_recording(recording.path).readings(), ReplayCounts())]
+    assert sum(a.verdict is not b.verdict for a, b in pairwise(found)) > 20
+    verdicts = [one.displayed.verdict for one in found if one.displayed is not None]
+    assert len(verdicts) == len(found)
+    assert sum(a is not b for a, b in pairwise(verdicts)) <= 2
+    assert verdicts[-1] is Decision.CLEAN
