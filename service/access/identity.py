@@ -43,6 +43,7 @@ POLICY: Final[dict[str, Role | None]] = {
     "GET /api/v1/feeders/{feeder}/state": Role.VIEWER,
     "GET /api/v1/feeders/{feeder}/meters/{meter}": Role.VIEWER,
     "GET /api/v1/feeders/{feeder}/history": Role.VIEWER,
+    "GET /api/v1/feeders/{feeder}/series": Role.VIEWER,
     "GET /api/v1/feeders/{feeder}/commissioning": Role.VIEWER,
     "GET /api/v1/feeders/{feeder}/commissioning/events": Role.VIEWER,
     "GET /api/v1/feeders/{feeder}/stream": Role.VIEWER,

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 from gridsec.interface import Cause, Decision
 from service.access.audit import AuditEntry
 from service.access.identity import Role
-from service.alarms.state_machine import Alarm
+from service.alarms.state_machine import Alarm, AlarmKind, Severity
 from service.engine.commissioning import CommissioningProgress, MeterCommissioning
 from service.report.report import FeederReport, MeterState, ModelOnly
 from service.store import AlarmEvent
@@ -110,6 +110,12 @@ class FeederSummary(BaseModel):
     verdict: Decision | None = None
     model_only: bool | None = Field(default=None, description="As in the state; null before the first tick.")
     since: float | None = Field(default=None, description="First consecutive tick with this verdict, Unix s.")
+    displayed_verdict: Decision | None = Field(
+        default=None, description="Verdict after the delays of the alarms; null before the first tick."
+    )
+    displayed_since: float | None = Field(
+        default=None, description="First tick of the time that led to it, Unix s."
+    )
     meters: int = Field(default=0, description="Number of meters at the latest tick.")
     suspects: int = Field(default=0, description="Meters and inverters named as manipulated at that tick.")
     silent: int = Field(default=0, description="Silent meters of customers at that tick.")
@@ -303,6 +309,9 @@ class HistoryMeter(BaseModel):
     suspect: bool
     v_volt_reported: float | None
     v_volt_estimated: float | None
+    v_volt_std: float | None = Field(
+        default=None, description="Standard deviation of the estimate, V; null in rows of earlier versions."
+    )
     score: float | None
     threshold: float | None
     model_only: ModelOnly = False
@@ -314,6 +323,61 @@ class History(BaseModel):
     feeder: str
     points: list[HistoryPoint]
     more: bool = Field(description="There may be older ones: repeat with `until` = `t` of the first.")
+
+
+Volts = list[float | None]
+
+
+class MeterSeries(BaseModel):
+    """One meter in every bucket of a series; null where the bucket has no such value. Voltages in V."""
+
+    meter: str
+    v_volt_reported_min: Volts
+    v_volt_reported_max: Volts
+    v_volt_estimated_min: Volts = Field(description="Lowest estimate that is not model only.")
+    v_volt_estimated_max: Volts
+    v_volt_band_min: Volts = Field(
+        description="Lowest end of the uncertainty band: estimate minus three standard deviations."
+    )
+    v_volt_band_max: Volts = Field(description="Highest end: estimate plus three standard deviations.")
+    seen: list[bool] = Field(description="A usable reading belongs to a stored tick of the bucket.")
+    suspect: list[bool] = Field(description="The verdict of a stored tick names the meter.")
+
+
+class AlarmOccurrence(BaseModel):
+    """One occurrence of an alarm."""
+
+    id: str
+    kind: AlarmKind
+    meter: str | None
+    customer: str | None
+    severity: Severity
+    t_raised: float
+    t_cleared: float | None = Field(description="Null while it is active.")
+
+
+class Series(BaseModel):
+    """Time series of meters: minimum and maximum of the stored ticks of each bucket."""
+
+    feeder: str
+    since: float = Field(description="Beginning of the first bucket, Unix s.")
+    until: float = Field(description="End of the last bucket, Unix s.")
+    bucket_s: float = Field(description="Duration of a bucket, s.")
+    step_s: float = Field(description="Grid of the stored ticks, s; changes of the verdict come in between.")
+    complete: bool = Field(description="False if older stored ticks are left out to bound the cost.")
+    t: list[float] = Field(description="Beginning of each bucket with a stored tick, Unix s.")
+    ticks: list[int] = Field(description="Number of stored ticks in each bucket.")
+    clean_s: list[float] = Field(
+        description="Time with the verdict clean in each bucket, s: from a stored tick to the next one, at "
+        "most to the end of its bucket and of its two minutes."
+    )
+    attacked_s: list[float] = Field(description="The same for the verdict attacked, s.")
+    undecided_s: list[float] = Field(description="The same for the verdict undecided, s.")
+    meters: list[MeterSeries]
+    alarms: list[AlarmOccurrence] = Field(
+        description="Alarms of the feeder in this time, oldest first, each occurrence by itself."
+    )
+    more_alarms: bool = Field(description="There are more; `alarms` are the newest ones.")
 
 
 class RejectedReading(BaseModel):

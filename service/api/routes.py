@@ -24,13 +24,13 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from fastapi.staticfiles import StaticFiles
-from pydantic import TypeAdapter
+from pydantic import StringConstraints, TypeAdapter
 from starlette.middleware.gzip import GZipMiddleware
 
 from gridsec.errors import FeederInvalid, GridsecError, Problem
 from service.access.identity import OPEN, POLICY, PUBLIC, Identity, NotPermitted, Role
 from service.alarms.state_machine import Alarm, AlarmKind, AlarmState, AlarmUnknown, Severity
-from service.api import models, tables
+from service.api import guide, models, tables
 from service.api.access import COOKIE, FRESH_S, Authenticator, authorise, client_of, session_of
 from service.api.description import BODY, TAGS, feeder_schemas
 from service.api.errors import Guard, HeadAsGet, handlers, problem
@@ -39,6 +39,7 @@ from service.errors import FeederNotLoaded, FeederUnknown
 from service.report.report import BUSBAR, FeederReport
 from service.settings import is_loopback
 from service.store import AlarmEvent, Store, StoreUnavailable
+from service.store.series import LONGEST_S
 
 
 class Backend(Protocol):
@@ -214,6 +215,7 @@ def create_api(
     app.include_router(_alarms)
     app.include_router(_operations)
     app.include_router(_sessions)
+    app.add_route(guide.ADDRESS, guide.show, include_in_schema=False)
     app.mount("/", _Web(directory=_WEB, html=True), name="web")
     _describe(app)
     app.state.queries = _queries(app.openapi())
@@ -408,6 +410,8 @@ def _summary(backend: Backend, fields: dict[str, Any], raised: int) -> models.Fe
             "age_s": backend.age(report),
             "model_only": report.model_only,
             "since": report.since,
+            "displayed_verdict": None if report.displayed is None else report.displayed.verdict,
+            "displayed_since": None if report.displayed is None else report.displayed.since,
             "meters": len(report.meters),
             "suspects": len(report.suspects) + sum(inverter.suspect for inverter in report.inverters),
             "silent": sum(one.meter != BUSBAR for one in report.silent),
@@ -511,6 +515,69 @@ def get_history(
     if media != tables.JSON:
         return _as_table(response, tables.encoded(tables.history(rows, meter), media), media)
     return {"feeder": feeder, "points": rows, "more": more}
+
+
+MAX_SERIES = 12
+"""Largest number of meters of one time series."""
+MAX_BUCKETS = 2000
+"""Largest number of buckets of one time series."""
+
+
+@_feeders.get("/{feeder}/series", response_model=models.Series, responses=_TABLES)
+def get_series(
+    request: Request,
+    response: Response,
+    backend: BackendHere,
+    feeder: KnownFeeder,
+    media: Media,
+    *,
+    meter: Annotated[
+        list[Annotated[str, StringConstraints(pattern=_NAME)]] | None,
+        Query(max_length=MAX_SERIES, description="May be repeated. Without: verdicts and alarms only."),
+    ] = None,
+    since: Since = None,
+    until: Until = None,
+    buckets: Annotated[
+        int, Query(ge=1, le=MAX_BUCKETS, description="Largest number of buckets; the ends may add one.")
+    ] = 600,
+) -> Any:
+    """Minimum and maximum of reported and estimated voltages and of the uncertainty band, by bucket.
+
+    Without `until` the series ends with the latest tick, without `since` it covers one hour. The longest one
+    covers 15 days. Tables have a row for each bucket and meter, and no alarms.
+    """
+    if until is None:
+        report = backend.report(feeder)
+        newest = backend.store.history(feeder, limit=1) if report is None else []
+        last = report.t if report is not None else newest[0]["t"] if newest else 0.0
+        until = last + 1.0
+    since = until - 3600.0 if since is None else since
+    if not 0.0 < until - since <= LONGEST_S:
+        text = f"must be before until, by at most {LONGEST_S:g} s"
+        raise RequestValidationError([{"loc": ("query", "since"), "msg": text, "type": "time"}])
+    wanted = list(dict.fromkeys(meter or ()))
+    for one in wanted:
+        if not _has(backend, feeder, one):
+            raise HTTPException(404, f"feeder {feeder!r} has no meter {one!r}")
+    found = tables.series(backend.store.series(feeder, wanted, since=since, until=until, buckets=buckets))
+    _link(request, response, media)
+    response.headers["Cache-Control"] = "no-store"
+    if media != tables.JSON:
+        return _as_table(response, tables.encoded(tables.series_table(found), media), media)
+    spans, more = backend.store.alarm_spans(feeder, since=since, until=until)
+    alarms = [
+        {
+            "id": span.alarm.id,
+            "kind": span.alarm.kind,
+            "meter": span.alarm.meter,
+            "customer": span.alarm.customer,
+            "severity": span.alarm.severity,
+            "t_raised": span.raised,
+            "t_cleared": span.cleared,
+        }
+        for span in spans
+    ]
+    return {"feeder": feeder, **found, "alarms": alarms, "more_alarms": more}
 
 
 def _has(backend: Backend, feeder: str, meter: str) -> bool:

@@ -1,4 +1,4 @@
-"""History and alarms as CSV, Parquet and Arrow IPC streams, chosen by the header `Accept`.
+"""History, series and alarms as CSV, Parquet and Arrow IPC streams, chosen by the header `Accept`.
 
 Each time column has a twin `<name>_utc`: a timestamp in UTC, in CSV as in RFC 3339.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
@@ -14,6 +15,7 @@ from typing import Any, Final
 import pyarrow as pa
 
 from service.alarms.state_machine import Alarm, to_json
+from service.store.series import EXTREMES, VERDICTS, Series
 
 JSON: Final = "application/json"
 CSV: Final = "text/csv"
@@ -39,9 +41,20 @@ _METER: dict[str, Any] = {
     "meter_suspect": _TRUE,
     "v_volt_reported": _NUMBER,
     "v_volt_estimated": _NUMBER,
+    "v_volt_std": _NUMBER,
     "score": _NUMBER,
     "threshold": _NUMBER,
     "meter_model_only": _TRUE,
+}
+_SERIES: dict[str, Any] = {
+    "t": _TIME,
+    "bucket_s": _NUMBER,
+    "ticks": pa.int64(),
+    **{f"{verdict}_s": _NUMBER for verdict in VERDICTS},
+    "meter": _TEXT,
+    "meter_seen": _TRUE,
+    "meter_suspect": _TRUE,
+    **dict.fromkeys(EXTREMES, _NUMBER),
 }
 _ALARMS: dict[str, Any] = {
     "id": _TEXT,
@@ -95,6 +108,54 @@ def history(points: Iterable[Mapping[str, Any]], meter: str | None) -> pa.Table:
         own = {f"meter_{name}" if name in _PREFIXED else name: value for name, value in one.items()}
         rows.append({**point, **own, "meter": one.get("meter")})
     return _table(rows, _HISTORY | (_METER if meter is not None else {}))
+
+
+def series(found: Series) -> dict[str, Any]:
+    """Return the buckets of a series as fields of `models.Series`."""
+    buckets = found.buckets
+    meters = [
+        {
+            "meter": meter,
+            **{name: _volts(buckets.extremes[:, e, k]) for e, name in enumerate(EXTREMES)},
+            "seen": buckets.seen[:, k].tolist(),
+            "suspect": buckets.suspect[:, k].tolist(),
+        }
+        for k, meter in enumerate(found.meters)
+    ]
+    return {
+        "since": found.since,
+        "until": found.until,
+        "bucket_s": found.bucket_s,
+        "step_s": found.step_s,
+        "complete": found.complete,
+        "t": buckets.t.tolist(),
+        "ticks": [int(count) for count in buckets.ticks.tolist()],
+        **{f"{v}_s": [round(s, 3) for s in buckets.verdict_s[:, k].tolist()] for k, v in enumerate(VERDICTS)},
+        "meters": meters,
+    }
+
+
+def _volts(values: Any) -> list[float | None]:
+    """Return voltages of single precision to a millivolt, or at 10 kV and above to 10 mV; None for NaN."""
+    return [round(v, 3 if abs(v) < 1e4 else 2) if math.isfinite(v) else None for v in values.tolist()]
+
+
+def series_table(fields: Mapping[str, Any]) -> pa.Table:
+    """Return the fields of `series` as a table: a row for each bucket and meter."""
+    common = ("t", "ticks", *(f"{verdict}_s" for verdict in VERDICTS))
+    rows = [
+        {
+            **{name: fields[name][j] for name in common},
+            "bucket_s": fields["bucket_s"],
+            "meter": one["meter"],
+            "meter_seen": one["seen"][j],
+            "meter_suspect": one["suspect"][j],
+            **{name: one[name][j] for name in EXTREMES},
+        }
+        for j in range(len(fields["t"]))
+        for one in fields["meters"]
+    ]
+    return _table(rows, _SERIES)
 
 
 def alarms(found: Sequence[Alarm]) -> pa.Table:

@@ -22,6 +22,7 @@ from feeders.model.site import PowerAges, Site, to_frame
 from feeders.registry import DesignedEstimator, WarmStart
 from gridsec.estimators.sequential import SuspicionRecord
 from gridsec.interface import Cause
+from service.alarms import displayed
 from service.alarms.conditions import conditions
 from service.alarms.state_machine import AlarmBook, AlarmRules, AlarmTransition, advance, hold
 from service.engine.commissioning import FeederCommissioning
@@ -199,6 +200,7 @@ class FeederMonitor:
         self.skipped = 0
         self.defect: Exception | None = None
         self._alarm_rules = alarm_rules(site, rules)
+        self._display: displayed.Display | None = None
         self._data_errors = DataErrors(site)
         self._power_ages = PowerAges(site)
         self._watcher: registry.DesignedEstimator | None = None
@@ -286,25 +288,29 @@ class FeederMonitor:
             book = hold(book, tick.t - tick.skipped * self.aligner.rules.tick_s)
         for _ in range(2):  # monitored, then failed
             try:
-                report = self._complete(self._judge(tick))
+                report, display = self._complete(self._judge(tick))
                 after, transitions = advance(book, self._alarm_rules, conditions(report), report.t)
             except Exception as error:  # noqa: BLE001 - ticks before and after keep their verdicts
                 self.break_down(error)
             else:
-                self.report, self.book = report, after
+                self.report, self.book, self._display = report, after, display
                 return TickResult(report, transitions)
-        self.report = self._complete(self._judge(tick))
+        self.report, self._display = self._complete(self._judge(tick))
         return TickResult(self.report, ())
 
-    def _complete(self, report: FeederReport) -> FeederReport:
-        """The report with its feeder's revision, the newest tick with a reading, and the verdict's start."""
+    def _complete(self, report: FeederReport) -> tuple[FeederReport, displayed.Display]:
+        """The report with revision, newest tick with a reading, and start and display of the verdict."""
         before = self.report
         last = None if before is None else before.t_measured
         goes_on = before is not None and before.verdict is report.verdict and before.t < report.t
         since = before.since if before is not None and goes_on else report.t
         # After the clock was set back, an earlier time of measurement would be in the future.
         measured = (last if last is None or last <= report.t else None) if report.model_only else report.t
-        return replace(report, revision=self.revision, t_measured=measured, since=since)
+        display = displayed.advance(self._display, self._alarm_rules, report)
+        complete = replace(
+            report, revision=self.revision, t_measured=measured, since=since, displayed=display.shown
+        )
+        return complete, display
 
     def _judge(self, tick: Tick) -> FeederReport:
         if self._watcher is None:

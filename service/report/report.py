@@ -598,6 +598,21 @@ class Silence:
 
 
 @dataclass(frozen=True, slots=True)
+class DisplayedVerdict:
+    """Verdict after the delays of the alarms: the raw one may change at every tick."""
+
+    verdict: Decision
+    since: Annotated[float, Field(description="First tick of the time that led to it, Unix s.")]
+    t: Annotated[float, Field(description="Newest tick with this verdict, Unix s.")]
+    cause: Annotated[Cause, Field(description="Cause at that tick.")]
+    reason: Annotated[str, Field(description="Reason at that tick.")]
+    suspects: Annotated[tuple[str, ...], Field(description="Meters named at that tick, with `substation`.")]
+    inverters: Annotated[
+        tuple[str, ...], Field(description="Inverters named at that tick, by customer.")
+    ] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class FeederReport:
     """A feeder at one tick, as REST's `state` and the zenoh key `estimate` show it."""
 
@@ -640,6 +655,10 @@ class FeederReport:
     data_error: Annotated[
         DataErrorReport | None,
         Field(description="Error of the feeder's files that explains the accused meters as well."),
+    ] = None
+    displayed: Annotated[
+        DisplayedVerdict | None,
+        Field(description="Verdict for operators: it changes only after the delays of the alarms."),
     ] = None
 
     @property

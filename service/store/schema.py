@@ -130,6 +130,19 @@ HISTORY = sa.Table(
     sa.Column("layout", SEQ, sa.ForeignKey("history_layout.id"), nullable=False),
     sa.Column("data", sa.LargeBinary, nullable=False),
 )
+ROLLUP = sa.Table(
+    "history_rollup",
+    META,
+    # Extremes of the stored ticks of a feeder in [t, t + `series.ROLLUP_S`), and the time of each verdict, s.
+    sa.Column("feeder", sa.String(64), primary_key=True),
+    sa.Column("t", sa.Double, primary_key=True),
+    sa.Column("layout", SEQ, sa.ForeignKey("history_layout.id"), primary_key=True, autoincrement=False),
+    sa.Column("ticks", sa.Integer, nullable=False),
+    sa.Column("clean_s", sa.Double, nullable=False),
+    sa.Column("attacked_s", sa.Double, nullable=False),
+    sa.Column("undecided_s", sa.Double, nullable=False),
+    sa.Column("data", sa.LargeBinary, nullable=False),
+)
 BAD = sa.Table(
     "bad_reading",
     META,
@@ -214,11 +227,16 @@ def _add_writer(connection: sa.Connection) -> None:
     WRITER.create(connection)
 
 
+def _add_rollup(connection: sa.Connection) -> None:
+    ROLLUP.create(connection)
+
+
 MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
     _add_commissioning,
     _add_distrust,
     _add_digest,
     _add_writer,
+    _add_rollup,
 )
 """Step k migrates schema version k + 1 to k + 2. A new database starts at the newest version."""
 

@@ -2,8 +2,8 @@
 
 History of a feeder: a report of 146 meters has 30 kB of JSON and comes every second. The history keeps ticks
 on a coarser grid and every tick with a change of the verdict, its cause or its suspects. A row contains the
-reported and the reconstructed voltage, score and threshold of every meter, as compressed single-precision
-columns (volts to 2e-5), about 2 kB.
+verdict, and of every meter the reported and the reconstructed voltage with its standard deviation, score and
+threshold, as compressed single-precision columns (volts to 2e-5), about 2.5 kB. `series` has the encoding.
 """
 
 from __future__ import annotations
@@ -11,18 +11,24 @@ from __future__ import annotations
 import json
 import math
 import threading
-import zlib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import sqlalchemy as sa
 import structlog
 
-from service.alarms.state_machine import Alarm, AlarmState, AlarmTransition, Change, from_json, to_json
-from service.report.report import BUSBAR, FeederReport, MeterState, finite
+from service.alarms.state_machine import (
+    Alarm,
+    AlarmState,
+    AlarmTransition,
+    Change,
+    first_id,
+    from_json,
+    to_json,
+)
+from service.report.report import FeederReport
 from service.store.connect import Connections
 from service.store.schema import (
     ALARM,
@@ -35,6 +41,7 @@ from service.store.schema import (
     HISTORY,
     LAYOUT,
     OUTBOX,
+    ROLLUP,
     WRITER,
     AlarmEvent,
     CommissioningChange,
@@ -44,6 +51,21 @@ from service.store.schema import (
     WriterLost,
     digest,
     migrate,
+)
+from service.store.series import (
+    MAX_ROWS,
+    ROLLUP_S,
+    ROWS_S,
+    Series,
+    bucket_of,
+    floor_to,
+    merge,
+    of_rollups,
+    of_rows,
+    pack,
+    roll_up,
+    rows,
+    unpack,
 )
 from service.store.state_codec import SnapshotKind, StateSnapshot
 
@@ -55,6 +77,7 @@ class Reader:
         self._connections = connections
         self._read = connections.read
         self.name = connections.name
+        self.history_step_s = HistoryRules().step_s
 
     def alarm(self, alarm_id: str) -> Alarm | None:
         """Return an alarm by its id."""
@@ -191,6 +214,67 @@ class Reader:
             for t, verdict, cause, data, layout in reversed(rows)
         ]
 
+    def series(
+        self, feeder: str, meters: Sequence[str], *, since: float, until: float, buckets: int = 600
+    ) -> Series:
+        """Return the time series of some meters of a feeder in [since, until), Unix s.
+
+        `buckets` is the largest number of buckets, extended by one at an end. A longer time than
+        `series.ROWS_S` is merged from roll-ups, and from the rows after the newest one.
+        """
+        bucket_s = bucket_of(until - since, buckets)
+        begin, end = floor_to(since, bucket_s), -floor_to(-until, bucket_s)
+        first, parts = begin, []
+        with self._read() as connection:
+            if until - since > ROWS_S:
+                rolled = _rollups(connection, feeder, begin, end)
+                parts.append(of_rollups(rolled, meters))
+                first = _rolled_until(connection, feeder) or begin
+            rows = _newest_rows(connection, feeder, max(first, begin), end)
+        parts.append(of_rows(rows[-MAX_ROWS:], meters, bucket_s, until))
+        return Series(
+            begin,
+            end,
+            bucket_s,
+            self.history_step_s,
+            tuple(meters),
+            merge(parts, bucket_s),
+            complete=len(rows) <= MAX_ROWS,
+        )
+
+    def alarm_spans(
+        self, feeder: str, *, since: float, until: float, limit: int = 200
+    ) -> tuple[list[AlarmSpan], bool]:
+        """Return the occurrences of the alarms of a feeder that overlap [since, until), oldest first.
+
+        Returns spans, more: `more` if there are further alarms than the `limit` newest ones.
+        """
+        a, e = ALARM.c, EVENT.c
+        overlap = sa.and_(a.feeder == feeder, sa.or_(a.t_cleared.is_(None), a.t_cleared >= since))
+        # Ids begin with the onset: an alarm that returned later keeps its id.
+        chosen = sa.select(a.id).where(overlap, a.id < first_id(until)).order_by(a.id.desc())
+        with self._read() as connection:
+            ids = list(connection.scalars(chosen.limit(limit + 1)))
+            changes = sa.select(e.alarm_id, e.t, e.change, e.data).where(
+                e.alarm_id.in_(ids[:limit]), e.change.in_([str(Change.RAISED), str(Change.CLEARED)])
+            )
+            found = connection.execute(changes.order_by(e.seq).limit(_CHANGES_READ)).all()
+        spans: dict[tuple[str, int], AlarmSpan] = {}
+        last: dict[str, AlarmSpan] = {}
+        for alarm_id, t, change, data in found:
+            if change == str(Change.RAISED):
+                last[alarm_id] = AlarmSpan(from_json(json.loads(data)), t, None)
+            elif alarm_id in last:
+                last[alarm_id] = replace(last[alarm_id], cleared=t)
+            if alarm_id in last:
+                spans[alarm_id, last[alarm_id].alarm.count] = last[alarm_id]
+        inside = [
+            span
+            for span in spans.values()
+            if span.raised < until and (span.cleared is None or span.cleared >= since)
+        ]
+        return sorted(inside, key=lambda span: span.raised), len(ids) > limit
+
     def history_meters(self, feeder: str) -> set[str]:
         """Return the meters of all kept ticks of a feeder."""
         kept = sa.select(HISTORY.c.layout).where(HISTORY.c.feeder == feeder).distinct()
@@ -244,6 +328,50 @@ class Reader:
         ]
 
 
+@dataclass(frozen=True, slots=True)
+class AlarmSpan:
+    """One occurrence of an alarm: the alarm when it was raised, and both times, Unix s."""
+
+    alarm: Alarm
+    raised: float
+    cleared: float | None  # None while it is active
+
+
+_CHANGES_READ = 5000
+"""Largest number of changes that `alarm_spans` reads."""
+
+
+def _rollups(connection: sa.Connection, feeder: str, begin: float, end: float) -> list[dict[str, Any]]:
+    """Roll-ups of a feeder in [begin, end), oldest first."""
+    r = ROLLUP.c
+    query = (
+        sa.select(r.t, r.ticks, r.clean_s, r.attacked_s, r.undecided_s, r.data, LAYOUT.c.meters)
+        .join(LAYOUT, LAYOUT.c.id == r.layout)
+        .where(r.feeder == feeder, r.t >= begin, r.t < end)
+        .order_by(r.t, r.layout)
+    )
+    return [dict(row) for row in connection.execute(query).mappings()]
+
+
+def _rolled_until(connection: sa.Connection, feeder: str) -> float | None:
+    """End of the newest roll-up of a feeder: all rows before it are rolled up. None without one."""
+    newest = connection.scalar(sa.select(sa.func.max(ROLLUP.c.t)).where(ROLLUP.c.feeder == feeder))
+    return None if newest is None else float(newest) + ROLLUP_S
+
+
+def _newest_rows(
+    connection: sa.Connection, feeder: str, begin: float, end: float
+) -> list[tuple[float, str, bytes, tuple[str, ...]]]:
+    """Newest rows of a feeder in [begin, end), oldest first: at most one more than `MAX_ROWS`."""
+    h = HISTORY.c
+    query = sa.select(h.t, h.verdict, h.data, h.layout).where(h.feeder == feeder, h.t >= begin, h.t < end)
+    found = connection.execute(query.order_by(h.t.desc()).limit(MAX_ROWS + 1)).all()
+    numbers = {row.layout for row in found}
+    texts = connection.execute(sa.select(LAYOUT.c.id, LAYOUT.c.meters).where(LAYOUT.c.id.in_(numbers)))
+    meters = {number: tuple(json.loads(text)) for number, text in texts}
+    return [(t, verdict, data, meters[layout]) for t, verdict, data, layout in reversed(found)]
+
+
 def _event(row: sa.RowMapping) -> AlarmEvent:
     return AlarmEvent(
         row["seq"],
@@ -284,9 +412,12 @@ class Store(Reader):
     def __init__(self, url: str, *, history: HistoryRules | None = None) -> None:
         super().__init__(Connections(url))
         self._history_rules = history or HistoryRules()
+        self.history_step_s = self._history_rules.step_s
         self._lock = threading.RLock()
         self._marks: dict[str, Mark] = {}
         self._since_prune: dict[str, int] = {}
+        # End of the roll-ups of each feeder, Unix s: all older rows are rolled up.
+        self._rolled: dict[str, float] = {}
         self._closed = threading.Event()
         try:
             with self._connections.opening() as connection:
@@ -390,7 +521,7 @@ class Store(Reader):
         transitions, rejected = tuple(transitions), tuple(rejected)
         kept, happened = tuple(kept), tuple(happened)
         with self._alone():
-            marks = dict(self._marks)
+            marks, rolled = dict(self._marks), dict(self._rolled)
             worthy = [report for report in reports if self._worth(marks, report)]
             if not (transitions or worthy or rejected or kept or happened or without or put):
                 return ()
@@ -402,6 +533,7 @@ class Store(Reader):
                     numbers = tuple(self._put_transition(connection, item) for item in transitions)
                     for report in worthy:
                         self._put_history(connection, report)
+                        _roll_up(connection, self._connections.insert, rolled, report)
                     if rejected:
                         _put_rejected(connection, rejected)
                     for item in kept:
@@ -412,7 +544,7 @@ class Store(Reader):
                         _forget_feeder(connection, without)
                     if put is not None:
                         self._put_feeder(connection, *put)
-            self._marks = marks
+            self._marks, self._rolled = marks, rolled
             self._last_event = max((self._last_event, *numbers))
             return numbers
 
@@ -507,6 +639,11 @@ class Store(Reader):
         # The number of rows fits the time limit of a call.
         oldest = sa.select(h.feeder, h.t).where(whose, h.t < report.t - keep).limit(_PRUNED_AT_ONCE)
         connection.execute(HISTORY.delete().where(sa.tuple_(h.feeder, h.t).in_(oldest)))
+        r = ROLLUP.c
+        others = [] if before is None else [r.feeder.not_in([*self._marks, report.feeder])]
+        past = (sa.or_(r.feeder == report.feeder, *others), r.t < report.t - keep - ROLLUP_S)
+        oldest = sa.select(r.feeder, r.t).where(*past).limit(_PRUNED_AT_ONCE)
+        connection.execute(ROLLUP.delete().where(sa.tuple_(r.feeder, r.t).in_(oldest)))
 
     def _layout(self, connection: sa.Connection, report: FeederReport) -> int:
         meters = json.dumps([meter.meter for meter in rows(report)])
@@ -515,6 +652,45 @@ class Store(Reader):
         if known is None:
             known = connection.execute(LAYOUT.insert().values(row).returning(LAYOUT.c.id)).scalar_one()
         return int(known)
+
+
+_ROLLED_AT_ONCE = 20
+"""Largest number of roll-ups that one stored tick adds: after an upgrade, 14 days take 84 minutes."""
+
+
+def _roll_up(connection: sa.Connection, insert: Any, rolled: dict[str, float], report: FeederReport) -> None:
+    """Add the roll-ups of the finished buckets before a report; `rolled` follows."""
+    h, r, feeder = HISTORY.c, ROLLUP.c, report.feeder
+    now = floor_to(report.t, ROLLUP_S)
+    until = rolled.get(feeder)
+    if until is None:
+        until = _rolled_until(connection, feeder)
+    if until is not None and report.t < until:  # The clock was set back.
+        connection.execute(ROLLUP.delete().where(r.feeder == feeder, r.t >= now))
+        until = now
+    if until is not None and now <= until:
+        rolled[feeder] = until
+        return
+    before = sa.and_(h.feeder == feeder, h.t < now, *([] if until is None else [h.t >= until]))
+    first = connection.scalar(sa.select(sa.func.min(h.t)).where(before))
+    if first is None:
+        rolled[feeder] = now
+        return
+    begin = floor_to(float(first), ROLLUP_S)
+    end = min(now, begin + _ROLLED_AT_ONCE * ROLLUP_S)
+    query = (
+        sa.select(h.t, h.verdict, h.layout, h.data, LAYOUT.c.meters)
+        .join(LAYOUT, LAYOUT.c.id == h.layout)
+        .where(h.feeder == feeder, h.t >= begin, h.t < end)
+        .order_by(h.t)
+    )
+    for row in roll_up(connection.execute(query).all(), end):
+        values = {"feeder": feeder, **row}
+        statement = insert(ROLLUP).values(values)
+        connection.execute(
+            statement.on_conflict_do_update(index_elements=["feeder", "t", "layout"], set_=values)
+        )
+    rolled[feeder] = end
 
 
 def _stored_before(connection: sa.Connection, key: int) -> bool:
@@ -557,10 +733,6 @@ def _put_rejected(connection: sa.Connection, rejected: Iterable[Rejected]) -> No
     connection.execute(BAD.delete().where(BAD.c.seq <= newest - BAD_READINGS_KEPT))
 
 
-_COLUMNS = ("v_volt_reported", "v_volt_estimated", "score", "threshold")
-_SEEN, _SUSPECT, _MODEL_ONLY = 1, 2, 4
-
-
 @dataclass(frozen=True, slots=True)
 class HistoryRules:
     """Grid and duration of the history."""
@@ -591,74 +763,3 @@ def worth_keeping(last: Mark | None, now: Mark, rules: HistoryRules) -> bool:
     changed = (last.verdict, last.cause, last.suspects) != (now.verdict, now.cause, now.suspects)
     step = rules.step_s
     return changed or step <= 0.0 or math.floor(now.t / step) > math.floor(last.t / step)
-
-
-def rows(report: FeederReport) -> tuple[MeterState, ...]:
-    """Return the meters of a row: those of the report, and the busbar meter as `BUSBAR`, without a score."""
-    now = report.busbar
-    busbar = MeterState(
-        meter=BUSBAR,
-        bus=report.buses[0].bus if report.buses else "",
-        seen=now.seen,
-        suspect=now.suspect,
-        score=None,
-        threshold=None,
-        v_volt_reported=now.v_volt_reported,
-        v_volt_estimated=now.v_volt_estimated,
-        v_volt_std=None,
-        v2_pu_estimated=None,
-        attack_volt_estimated=now.attack_volt_estimated,
-        model_only=now.model_only,
-    )
-    return (*report.meters, busbar)
-
-
-def pack(meters: Sequence[MeterState]) -> bytes:
-    """Pack the meters of a report: four float32 columns (NaN for None), then one byte of flags each."""
-    none = math.nan
-    table = np.array(
-        [[none if (v := getattr(m, name)) is None else v for m in meters] for name in _COLUMNS], dtype="<f4"
-    )
-    flags = bytes(_SEEN * m.seen | _SUSPECT * m.suspect | _MODEL_ONLY * m.model_only for m in meters)
-    return zlib.compress(table.tobytes() + flags, 6)
-
-
-def unpack(data: bytes, meters: Sequence[str], only: str | None = None) -> dict[str, Any]:
-    """Return the values of a kept row for the feeder and, on request, for one of its meters.
-
-    `meters` are the ids of the row's meters, in order; `only` is the requested meter. Returns `seen` (number
-    of meters), `suspects`, `v_volt_lowest`, `v_volt_highest`, `model_only`, and `meter`: its fields as in
-    REST's `state`, or None. The busbar meter may be among the suspects; `seen` and the extremes leave it out.
-    The extremes leave out model-only values; rows of earlier versions mark none.
-    """
-    raw = zlib.decompress(data)
-    size = len(meters)
-    table = np.frombuffer(raw, dtype="<f4", count=4 * size).reshape(4, size)
-    flags = np.frombuffer(raw, dtype=np.uint8, offset=16 * size)
-    volts = table[_COLUMNS.index("v_volt_estimated")]
-    others = np.array([meter != BUSBAR for meter in meters], dtype=np.bool_)
-    alone = (flags & _MODEL_ONLY) > 0
-    volts = volts[np.isfinite(volts) & others & ~alone]
-    one = None
-    if only in meters:
-        k = meters.index(only)
-        one = {
-            "meter": only,
-            "seen": bool(flags[k] & _SEEN),
-            "suspect": bool(flags[k] & _SUSPECT),
-            **{name: _short(float(table[row, k])) for row, name in enumerate(_COLUMNS)},
-            "model_only": bool(alone[k]),
-        }
-    return {
-        "seen": int(np.count_nonzero((flags & _SEEN) * others)),
-        "suspects": [meters[int(k)] for k in np.flatnonzero(flags & _SUSPECT)],
-        "v_volt_lowest": _short(float(volts.min())) if volts.size else None,
-        "v_volt_highest": _short(float(volts.max())) if volts.size else None,
-        "model_only": bool(alone.size and alone.all()),
-        "meter": one,
-    }
-
-
-def _short(value: float) -> float | None:
-    """Return a single-precision number without insignificant digits."""
-    return finite(float(f"{value:.7g}"))

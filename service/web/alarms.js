@@ -31,7 +31,7 @@ function hint({ data_error: error }) {
 }
 
 export class Alarms {
-  constructor({ onPick, onLink }) {
+  constructor({ onPick, onLink, onSeries }) {
     this.alarms = new Map();
     this.items = new Map();
     this.loading = 0;
@@ -41,6 +41,7 @@ export class Alarms {
     this.turn = 0;
     this.onPick = onPick;
     this.onLink = onLink;
+    this.onSeries = onSeries; // Called with an alarm of a meter.
     this.feeder = null;
     this.source = null;
     this.retry = null;
@@ -221,7 +222,9 @@ export class Alarms {
         } } })),
         el("p", { class: "numbers", text: numbers }),
         alarm.kind === "meter-manipulated" ? hint(e) : null,
-        el("p", { class: "quiet since", text: since }), answered),
+        el("p", { class: "quiet since", text: since }),
+        alarm.meter ? el("button", { type: "button", class: "plain", text: "Time series", on: { click: () => this.onSeries(alarm) } }) : null,
+        answered),
       alarm.acknowledged_by === null
         ? el("button", { type: "button", class: "ack", text: "Acknowledge", on: { click: () => this.ask(alarm) } })
         : null);

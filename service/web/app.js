@@ -1,21 +1,17 @@
 // Assembly of the page: selection of the feeder, its live states, and the freshness of the data.
 
 import { Alarms } from "./alarms.js";
+import { Banner, offline } from "./banner.js";
 import { Commissioning } from "./commissioning.js";
 import { showDetail } from "./detail.js";
 import { Diagram } from "./diagram.js";
-import { bare, busbarWords, byId, clock, duration, el, getJson, isKnown, signed, status, volt } from "./dom.js";
+import { bare, busbarWords, byId, clock, duration, el, getJson, isKnown, signed, status } from "./dom.js";
 import { Fleet, worstFirst } from "./fleet.js";
+import { Series } from "./series.js";
 import { session } from "./session.js";
 
 const API = "/api/v1/feeders";
 const KEPT = 600;
-const SIGNS = {
-  clean: "M5 17l7 7L27 8",
-  attacked: "M16 4L29 28H3zM16 12v8M16 23.500v.5",
-  undecided: "M10 11a6 6 0 1 1 8 6q-2 1-2 4M16 26.500v.5",
-  none: "M16 5a11 11 0 1 0 .01 0M16 9v7l5 3",
-};
 
 const page = { feeder: null, report: null, refused: null, selected: null, source: null, retry: null, heard: null, word: "…", others: 0, linked: true, alarmsLinked: true, past: new Map(), turn: 0 };
 const diagram = new Diagram({ onSelect: (id) => select(id === page.selected ? null : id) });
@@ -27,10 +23,34 @@ const alarms = new Alarms({
     if (customer) select(customer.customer);
   },
   onLink: (up) => { page.alarmsLinked = up; },
+  onSeries: async (alarm) => {
+    if (alarm.feeder !== page.feeder?.name) await show(alarm.feeder);
+    if (alarm.feeder !== page.feeder?.name) return;
+    series.open([alarm.meter], around(alarm));
+  },
 });
 
 const fleet = new Fleet({ onPick: (name) => show(name), onChange: (attacked) => { page.others = attacked; title(); } });
+const series = new Series({ onChange: () => address() });
+const banner = new Banner({ onSelect: (id) => select(id), onSeries: (meters) => series.open(meters) });
 const commissioning = new Commissioning({ onChange: () => detail() });
+
+// Address of the page: the feeder, and the shown time series.
+function address(name = page.feeder?.name) {
+  const query = series.query();
+  if (name) history.replaceState(null, "", `#${encodeURIComponent(name)}${query ? `?${query}` : ""}`);
+}
+
+function wanted() {
+  const [name, query = ""] = location.hash.slice(1).split("?");
+  return { name: decodeURIComponent(name), query: new URLSearchParams(query) };
+}
+
+// Time around an alarm: half an hour before it, and half an hour after its end unless it is active.
+function around(alarm) {
+  const until = alarm.state === "cleared" ? alarm.t_cleared + 1800 : null;
+  return { since: alarm.t_raised - 1800, until };
+}
 
 // ---------------------------------------------------------------- the feeder
 
@@ -53,11 +73,12 @@ async function start() {
     return;
   }
   fleet.begin(feeders);
-  const wanted = decodeURIComponent(location.hash.slice(1));
-  await show(feeders.some((f) => f.name === wanted) ? wanted : feeders[0].name);
+  const { name, query } = wanted();
+  const known = feeders.some((f) => f.name === name);
+  await show(known ? name : feeders[0].name, known ? query : undefined);
 }
 
-async function show(name) {
+async function show(name, query = new URLSearchParams()) {
   clearTimeout(page.retry);
   page.source?.close();
   page.turn += 1;
@@ -68,9 +89,10 @@ async function show(name) {
     if (found.status === 401) await session.begin();
     else if (found.answered) refused(name, found.message);
     else page.linked = false;
-    page.retry = setTimeout(() => show(name), 3000);
+    page.retry = setTimeout(() => show(name, query), 3000);
     return;
   }
+  const again = page.feeder?.name === name; // Connected again, or other tables: the series stays.
   page.feeder = found;
   page.refused = null;
   page.report = null;
@@ -79,7 +101,8 @@ async function show(name) {
   page.opened = performance.now();
   byId("feeder").value = name;
   fleet.select(name);
-  history.replaceState(null, "", `#${encodeURIComponent(name)}`);
+  series.watch(found, again && series.query() ? new URLSearchParams(series.query()) : query);
+  address(name);
   byId("meters").replaceChildren();
   select(null);
   diagram.show(page.feeder);
@@ -93,7 +116,8 @@ async function show(name) {
 function refused(name, why) {
   Object.assign(page, { feeder: null, report: null, heard: null, past: new Map(), refused: why, linked: true });
   byId("feeder").value = name;
-  history.replaceState(null, "", `#${encodeURIComponent(name)}`);
+  series.watch(null);
+  address(name);
   byId("meters").replaceChildren();
   select(null);
   diagram.clear();
@@ -133,6 +157,7 @@ function take(report) {
     page.past.set(meter.meter, past);
   }
   diagram.update(report);
+  series.take(report);
   verdict();
   fresh();
   detail();
@@ -150,44 +175,17 @@ const point = (t, m) => ({
 
 function verdict() {
   const { report, feeder } = page;
-  const decision = report?.verdict ?? "none";
-  byId("verdict").dataset.verdict = decision;
-  byId("sign").setAttribute("d", SIGNS[decision]);
-  byId("decision").textContent = report ? decision.toUpperCase() : "NO DATA";
-  byId("reason").textContent = report ? report.reason : page.refused ?? "Waiting for the first tick.";
   byId("busbar-meter").hidden = !report?.busbar?.suspect;
   byId("busbar-meter").textContent = report?.busbar?.suspect ? busbarWords(report.busbar) : "";
-  title(report ? decision.toUpperCase() : "…");
   if (!report) {
-    byId("chips").replaceChildren();
-    byId("facts").replaceChildren();
+    banner.empty(page.refused ?? "Waiting for the first tick.");
+    title("…");
     return;
   }
-  const customer = new Map(feeder.layout.customers.map((c) => [c.meter, c.customer]));
-  const chip = (meter, kind, text) => el("button", {
-    type: "button", class: "chip", "data-status": kind, text, on: { click: () => select(customer.get(meter) ?? null) },
-  });
-  const suspects = report.meters.filter((m) => m.suspect);
-  const liar = report.busbar?.suspect ? [report.busbar] : [];
-  const inverters = (report.inverters ?? []).filter((i) => i.suspect);
-  byId("chips").replaceChildren(
-    ...[...suspects, ...liar].map((m) => chip(m.meter, "suspect", `${m.meter} ${signed(m.attack_volt_estimated)} V`)),
-    ...inverters.map((i) => el("button", {
-      type: "button", class: "chip", "data-status": "suspect",
-      text: `inverter of ${i.customer} ${signed(i.attack_kvar_estimated)} kvar`, on: { click: () => select(i.customer) },
-    })),
-    ...report.silent.map((s) => chip(s.meter, "silent", `${s.meter} silent ${isKnown(s.seconds) ? duration(s.seconds) : ""}`)));
   const several = diagram.level === null;
   const real = report.meters.filter((m) => !m.model_only).map((m) => (several ? m.v2_pu_estimated : m.v_volt_estimated)).filter(isKnown);
   const [low, high] = [Math.min(...real), Math.max(...real)].map((v) => (several ? Math.sqrt(v).toFixed(3) : bare(v)));
-  const range = real.length ? `${low} – ${high} ${several ? "pu" : "V"}` : "–";
-  const fact = (name, value) => el("div", {}, el("dt", { text: name }), el("dd", { text: value }));
-  byId("facts").replaceChildren(
-    fact("Meters available", `${report.meters.filter((m) => m.seen).length} of ${report.meters.length}`),
-    fact("Suspects", String(suspects.length + liar.length + inverters.length)),
-    fact("Identifies up to", `${report.max_attacked} manipulated`),
-    fact("Reconstructed voltages", range),
-    fact("Tick", clock(report.t)));
+  title(banner.show(report, feeder, real.length ? `${low} – ${high} ${several ? "pu" : "V"}` : "–"));
 }
 
 // ------------------------------------------------------------- the freshness
@@ -224,20 +222,16 @@ function fresh() {
   // A feeder that is not monitored does not make the alarms of others stale.
   byId("main").dataset.alarms = page.alarmsLinked && state !== "lost" && state !== "stale" ? "yes" : "no";
   const believable = state === "live";
+  offline(state, page.report, age);
   byId("main").dataset.fresh = believable ? "yes" : "no";
   if (state === "nodata") {
     // The model continues without readings; its voltages must not look like measured ones.
-    byId("decision").textContent = "NO DATA";
-    byId("verdict").dataset.verdict = "none";
-    byId("sign").setAttribute("d", SIGNS.none);
-    byId("reason").textContent = `${words.nodata.replace("n", "N")}. The voltages are those of the model alone. ${page.report.reason}`;
+    banner.old("NO DATA", `${words.nodata.replace("n", "N")}. The voltages are those of the model alone. ${page.report.reason}`, "nodata");
     title("NO DATA");
   } else if (!believable && !waiting) {
     // An old verdict must not look like a verdict.
-    byId("decision").textContent = "NO LIVE DATA";
-    byId("verdict").dataset.verdict = "none";
-    byId("sign").setAttribute("d", SIGNS.none);
-    byId("reason").textContent = `No data for ${duration(age)}. Last verdict, at ${clock(page.report.t)}: ${page.report.verdict}.`;
+    const last = page.report.displayed ?? page.report;
+    banner.old("NO LIVE DATA", `No data for ${duration(age)}. Last verdict, at ${clock(page.report.t)}: ${last.verdict}.`, "stale");
     title("NO LIVE DATA");
   } else if (!waiting && byId("decision").textContent.startsWith("NO ")) {
     verdict();
@@ -282,6 +276,7 @@ function detail() {
   const now = { meter, inverter, alone, v: diagram.voltAt(customer), std: known?.v_volt_std ?? meter?.v_volt_std };
   const own = commissioning.of(customer.meter);
   byId("replaced").hidden = own === null;
+  byId("detail-series").hidden = !customer.meter;
   showDetail(page.feeder, customer, { ...now, own, report: page.report }, page.past.get(customer.meter) ?? []);
 }
 
@@ -310,6 +305,10 @@ function table() {
 }
 
 byId("feeder").addEventListener("change", (event) => show(event.target.value));
+byId("detail-series").addEventListener("click", () => {
+  const { meter } = page.feeder.layout.customers.find((c) => c.customer === page.selected);
+  series.open([meter]);
+});
 byId("unselect").addEventListener("click", () => select(null));
 byId("replaced").addEventListener("click", () => {
   const { meter } = page.feeder.layout.customers.find((c) => c.customer === page.selected);
@@ -317,8 +316,9 @@ byId("replaced").addEventListener("click", () => {
 });
 byId("meters-box").addEventListener("toggle", table);
 addEventListener("hashchange", () => {
-  const name = decodeURIComponent(location.hash.slice(1));
-  if (name && name !== page.feeder?.name) show(name);
+  const { name, query } = wanted();
+  if (name && name !== page.feeder?.name) show(name, query);
+  else if (page.feeder) series.restore(query);
 });
 setInterval(fresh, 500);
 start();

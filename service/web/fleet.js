@@ -15,7 +15,7 @@ export function stateOf(feeder) {
   if (feeder.phase === "failed") return "unwatched";
   const stale = isKnown(feeder.age_s) && isKnown(feeder.patience_s) && feeder.age_s > feeder.patience_s;
   if (!feeder.verdict || feeder.model_only || stale) return "nodata";
-  return feeder.verdict;
+  return feeder.displayed_verdict ?? feeder.verdict;
 }
 
 export const worstFirst = (a, b) => RANK.indexOf(stateOf(a)) - RANK.indexOf(stateOf(b))
@@ -88,7 +88,9 @@ export class Fleet {
 
   cells(feeder) {
     const state = stateOf(feeder);
-    const since = isKnown(feeder.since) && isKnown(feeder.t) && state === feeder.verdict ? duration(feeder.t - feeder.since) : "";
+    const begun = feeder.displayed_since ?? feeder.since;
+    const decided = state === (feeder.displayed_verdict ?? feeder.verdict);
+    const since = isKnown(begun) && isKnown(feeder.t) && decided ? duration(feeder.t - begun) : "";
     const silent = feeder.meters ? `${Math.round((100 * feeder.silent) / feeder.meters)} %` : "";
     return [state, feeder.title || feeder.name, since, String(feeder.suspects || ""), silent, String(feeder.raised || "")];
   }

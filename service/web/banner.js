@@ -1,0 +1,184 @@
+// Status banner: displayed verdict, its start, its certainty, the next step, and all suspects.
+// The displayed verdict changes only after the delays of the alarms; the verdict of the latest tick stands beside it.
+
+import { byId, clock, duration, el, isKnown, signed } from "./dom.js";
+
+const GUIDE = "operator-guide";
+const SHOWN = 8; // Suspects before the button for all.
+const SIGNS = {
+  clean: "M5 17l7 7L27 8",
+  attacked: "M16 4L29 28H3zM16 12v8M16 23.500v.5",
+  undecided: "M10 11a6 6 0 1 1 8 6q-2 1-2 4M16 26.500v.5",
+  none: "M16 5a11 11 0 1 0 .01 0M16 9v7l5 3",
+};
+// Next step: sentence, and section of the operator guide.
+const STEPS = {
+  clean: ["No action is needed.", "verdict-clean"],
+  attacked: ["Use the reconstructed voltages, and have the named devices inspected.", "verdict-attacked"],
+  files: ["Compare the named customers with the field first: the files may be wrong.", "errors-of-the-files"],
+  undecided: ["Do not rely on the voltages until the cause is found.", "verdict-undecided"],
+  "silent-meters": ["Look for the readings of the silent meters.", "verdict-undecided"],
+  "no-busbar": ["Restore the readings of the busbar meter.", "verdict-undecided"],
+  "missing-powers": ["Restore the power readings of the named customers.", "verdict-undecided"],
+  "clock-offset": ["Set the clock of the named meter.", "verdict-undecided"],
+  settling: ["Wait: the monitor has begun and settles.", "verdict-undecided"],
+  ambiguous: ["Inspect the candidates, the likeliest first.", "verdict-undecided"],
+  nodata: ["Restore the connection of the meters.", "no-data"],
+  stale: ["Check the service and its connection.", "no-data"],
+};
+
+const percent = (share) => `${Math.round(100 * share)} %`;
+
+// The displayed verdict of a report; services of earlier versions send the raw one only.
+export function displayed(report) {
+  const named = report.meters.filter((m) => m.suspect).map((m) => m.meter);
+  return report.displayed ?? {
+    verdict: report.verdict, since: report.since, t: report.t, cause: report.cause, reason: report.reason,
+    suspects: report.busbar?.suspect ? [...named, report.busbar.meter] : named,
+    inverters: (report.inverters ?? []).filter((i) => i.suspect).map((i) => i.customer),
+  };
+}
+
+function explanationWords({ meters, inverters, powers = [], probability }) {
+  const parts = [...meters, ...inverters.map((c) => `inverter of ${c}`), ...powers.map((c) => `reported power of ${c}`)];
+  return `${parts.join(" and ")} (${percent(probability)})`;
+}
+
+// Certainty of the displayed verdict, from the numbers of the latest tick.
+function certainty(report, shown) {
+  const judged = report.meters.filter((m) => m.seen && isKnown(m.score) && isKnown(m.threshold) && m.threshold > 0);
+  const ratio = (m) => m.score / m.threshold;
+  const times = (value) => (value >= 10 ? String(Math.round(value)) : value.toFixed(1));
+  const tested = `${judged.length} of ${report.meters.length} meters tested`;
+  if (shown.verdict === "attacked") {
+    const named = judged.filter((m) => shown.suspects.includes(m.meter));
+    if (!named.length) return `${tested} at this tick.`;
+    const strongest = named.reduce((a, b) => (ratio(b) > ratio(a) ? b : a));
+    const rivals = report.explanations?.length ? ` Explanations: ${report.explanations.slice(0, 3).map(explanationWords).join(", ")}.` : "";
+    return `Strongest evidence at this tick: ${strongest.meter}, ${times(ratio(strongest))} times the largest score of an honest meter.${rivals}`;
+  }
+  if (shown.verdict === "clean") {
+    if (!judged.length) return `${tested} at this tick.`;
+    const largest = judged.reduce((a, b) => (ratio(b) > ratio(a) ? b : a));
+    return `${tested}; largest score ${percent(ratio(largest))} of its threshold (${largest.meter}).`;
+  }
+  if (report.explanations?.length) return `Possible: ${report.explanations.slice(0, 3).map(explanationWords).join(", or ")}.`;
+  return `No answer: neither an attack nor its absence is established. ${tested}.`;
+}
+
+function stepOf(report, shown) {
+  if (shown.verdict === "attacked") return report.data_error ? STEPS.files : STEPS.attacked;
+  if (shown.verdict === "clean") return STEPS.clean;
+  return STEPS[shown.cause] ?? STEPS.undecided;
+}
+
+export class Banner {
+  constructor({ onSelect, onSeries }) {
+    this.onSelect = onSelect; // Called with a customer.
+    this.onSeries = onSeries; // Called with meters that belong to no customer.
+    this.all = false; // All suspects are listed.
+    this.offsets = new Map(); // Newest deviation of each suspect, V: an undecided tick may have none.
+    this.feeder = null;
+  }
+
+  decision(kind, word) {
+    byId("verdict").dataset.verdict = kind;
+    byId("sign").setAttribute("d", SIGNS[kind]);
+    byId("decision").textContent = word;
+  }
+
+  next([sentence, section] = []) {
+    byId("next").hidden = sentence === undefined;
+    byId("next").replaceChildren(
+      el("span", { text: `${sentence ?? ""} ` }),
+      el("a", { href: `${GUIDE}#${section ?? ""}`, target: "_blank", rel: "noopener", text: "Operator guide" }));
+  }
+
+  // Before the first tick, or with the reason why a feeder is not monitored.
+  empty(reason) {
+    this.decision("none", "NO DATA");
+    byId("reason").textContent = reason;
+    for (const id of ["since", "certainty"]) byId(id).textContent = "";
+    this.next(STEPS.nodata);
+    this.offsets.clear();
+    byId("chips").replaceChildren();
+    byId("facts").replaceChildren();
+  }
+
+  // The values shown are old, or those of the model alone: the verdict must not look like one.
+  old(word, reason, step) {
+    this.decision("none", word);
+    byId("reason").textContent = reason;
+    for (const id of ["since", "certainty"]) byId(id).textContent = "";
+    this.next(STEPS[step]);
+  }
+
+  // Returns the displayed verdict in capital letters.
+  show(report, feeder, range) {
+    if (feeder !== this.feeder) {
+      Object.assign(this, { feeder, all: false });
+      this.offsets.clear();
+    }
+    const shown = displayed(report);
+    const word = shown.verdict.toUpperCase();
+    this.decision(shown.verdict, word);
+    const raw = report.verdict !== shown.verdict;
+    byId("reason").textContent = raw ? shown.reason : report.reason;
+    const since = isKnown(shown.since) ? `Since ${clock(shown.since)} (${duration(report.t - shown.since)}).` : "";
+    const now = raw ? ` Latest tick: ${report.verdict}, ${report.cause.replaceAll("-", " ")}.` : "";
+    byId("since").textContent = `${since}${now}`.trim();
+    byId("certainty").textContent = certainty(report, shown);
+    this.next(stepOf(report, shown));
+    this.chips(report, shown);
+    this.facts(report, shown, range);
+    return word;
+  }
+
+  chips(report, shown) {
+    const customer = new Map(this.feeder.layout.customers.map((c) => [c.meter, c.customer]));
+    for (const m of [...report.meters, ...(report.busbar ? [report.busbar] : [])]) {
+      if (m.suspect && isKnown(m.attack_volt_estimated)) this.offsets.set(m.meter, m.attack_volt_estimated);
+    }
+    const go = (meter) => (customer.has(meter) ? this.onSelect(customer.get(meter)) : this.onSeries([meter]));
+    const chip = (kind, text, click) => el("button", { type: "button", class: "chip", "data-status": kind, text, on: { click } });
+    const off = (meter) => (this.offsets.has(meter) ? ` ${signed(this.offsets.get(meter))} V` : "");
+    const named = new Map((report.inverters ?? []).map((i) => [i.customer, i]));
+    const kvar = (c) => (isKnown(named.get(c)?.attack_kvar_estimated) ? ` ${signed(named.get(c).attack_kvar_estimated)} kvar` : "");
+    const accused = new Set([...shown.suspects, ...shown.inverters]);
+    const candidates = shown.verdict === "undecided" ? (report.explanations ?? []).flatMap((e) => [...e.meters, ...e.inverters]) : [];
+    const every = [
+      ...shown.suspects.map((m) => chip("suspect", `${m}${off(m)}`, () => go(m))),
+      ...shown.inverters.map((c) => chip("suspect", `inverter of ${c}${kvar(c)}`, () => this.onSelect(c))),
+      ...[...new Set(candidates)].filter((one) => !accused.has(one)).map((one) =>
+        chip("doubtful", `candidate ${one}`, () => (customer.has(one) || one === "substation" ? go(one) : this.onSelect(one)))),
+      ...report.silent.map((s) => chip("silent", `${s.meter} silent ${isKnown(s.seconds) ? duration(s.seconds) : ""}`, () => go(s.meter))),
+    ];
+    const rest = every.length - SHOWN;
+    const more = rest > 0
+      ? [el("button", { type: "button", class: "plain", "aria-expanded": String(this.all), text: this.all ? "Show fewer" : `Show all ${every.length}`, on: { click: () => { this.all = !this.all; this.chips(report, shown); byId("chips").lastElementChild.focus(); } } })]
+      : [];
+    byId("chips").replaceChildren(...(rest > 0 && !this.all ? every.slice(0, SHOWN) : every), ...more);
+  }
+
+  facts(report, shown, range) {
+    const fact = (name, value) => el("div", {}, el("dt", { text: name }), el("dd", { text: value }));
+    byId("facts").replaceChildren(
+      fact("Meters available", `${report.meters.filter((m) => m.seen).length} of ${report.meters.length}`),
+      fact("Suspects", String(shown.suspects.length + shown.inverters.length)),
+      fact("Identifies up to", `${report.max_attacked} manipulated`),
+      fact("Reconstructed voltages", range),
+      fact("Tick", clock(report.t)));
+  }
+}
+
+// The bar of a page without a connection; `state` is that of the link.
+export function offline(state, report, age) {
+  const lost = state === "lost";
+  byId("offline").hidden = !lost;
+  byId("main").dataset.link = lost ? "lost" : "up";
+  if (!lost) return;
+  const last = report ? `The page shows the state of ${clock(report.t)}, ${duration(age ?? 0)} ago.` : "No data has been received.";
+  const text = `Not connected to the service. ${last} It connects again by itself.`;
+  if (byId("offline").textContent !== text) byId("offline").textContent = text;
+}
+
