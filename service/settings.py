@@ -90,6 +90,7 @@ class Settings(BaseSettings):
     meter_keys: Path | None = None
     unsigned: Literal["refuse", "accept"] = "refuse"
     plaintext_network: bool = False
+    notify: Path | None = None
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     log_format: Literal["console", "json"] = "console"
 
@@ -149,7 +150,7 @@ class Settings(BaseSettings):
             raise InputInvalid([Problem("unknown-name", text)])
         return value
 
-    @field_validator("zenoh_config")
+    @field_validator("zenoh_config", "notify")
     @classmethod
     def _file(cls, value: Path | None) -> Path | None:
         if value is not None and not value.is_file():

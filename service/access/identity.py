@@ -55,11 +55,25 @@ POLICY: Final[dict[str, Role | None]] = {
     "PUT /api/v1/feeders/{feeder}": Role.ENGINEER,
     "DELETE /api/v1/feeders/{feeder}": Role.ENGINEER,
     "POST /api/v1/feeders/{feeder}/commissioning": Role.ENGINEER,
+    "GET /api/v1/notifications": Role.OPERATOR,
+    "GET /api/v1/notifications/dead-letters": Role.OPERATOR,
+    "POST /api/v1/notifications/dead-letters/resend": Role.ENGINEER,
+    "POST /api/v1/notifications/dead-letters/discard": Role.ENGINEER,
     "GET /api/v1/audit": Role.ADMIN,
 }
 """Least role by method and path. The files of the web page hold no data and are public."""
 
-WHOLE_FLEET: Final = frozenset({"GET /metrics", "GET /api/v1/bad-readings", "GET /api/v1/audit"})
+WHOLE_FLEET: Final = frozenset(
+    {
+        "GET /metrics",
+        "GET /api/v1/bad-readings",
+        "GET /api/v1/notifications",
+        "GET /api/v1/notifications/dead-letters",
+        "POST /api/v1/notifications/dead-letters/resend",
+        "POST /api/v1/notifications/dead-letters/discard",
+        "GET /api/v1/audit",
+    }
+)
 """Routes with data of all feeders; identities with restricted feeders have no access."""
 
 

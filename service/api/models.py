@@ -11,13 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, StringConstraints, ValidationError
 
 from gridsec.interface import Cause, Decision
 from service.access.audit import AuditEntry
 from service.access.identity import Role
 from service.alarms.state_machine import Alarm
 from service.engine.commissioning import CommissioningProgress, MeterCommissioning
+from service.notify.delivery import TargetStatus
 from service.report.report import FeederReport, MeterState, ModelOnly
 from service.store import AlarmEvent
 from service.store.schema import CommissioningEvent
@@ -220,6 +221,53 @@ class AuditLog(BaseModel):
     """Entries of the audit log."""
 
     entries: list[AuditEntry]
+
+
+class Targets(BaseModel):
+    """Targets of notifications."""
+
+    targets: list[TargetStatus]
+
+
+class Letter(BaseModel):
+    """Message that was given up."""
+
+    id: int = Field(description="Number of the dead letter.")
+    target: str
+    number: int = Field(description="Number of the event.")
+    message_id: str = Field(description="The same at every attempt.")
+    type: str
+    t: float
+    died: float = Field(description="Time at which it was given up.")
+    attempts: int
+    problem: str = Field(description="Problem of the last attempt.")
+    resend: bool = Field(description="Requested to be sent again.")
+    message: JsonValue = Field(description="The message.")
+
+
+class Letters(BaseModel):
+    """A page of dead letters, oldest first."""
+
+    dead_letters: list[Letter]
+    next: int | None = Field(description="`after` of the next page; null on the last one.")
+
+
+class LetterChoice(BaseModel):
+    """Choice of dead letters; without a field all of them."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    target: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]{1,64}$")] | None = None
+    ids: (
+        Annotated[list[Annotated[int, Field(ge=1, le=(1 << 63) - 1)]], Field(min_length=1, max_length=1000)]
+        | None
+    ) = None
+
+
+class LetterCount(BaseModel):
+    """Number of chosen dead letters."""
+
+    count: int
 
 
 class Acknowledgement(BaseModel):

@@ -14,6 +14,7 @@ import json
 import secrets
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Collection, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path as FilePath
 from typing import Annotated, Any, Protocol, cast
@@ -36,6 +37,7 @@ from service.api.description import BODY, TAGS, feeder_schemas
 from service.api.errors import Guard, HeadAsGet, handlers, problem
 from service.engine.commissioning import CommissioningProgress
 from service.errors import FeederNotLoaded, FeederUnknown
+from service.notify.delivery import Notifier
 from service.report.report import BUSBAR, FeederReport
 from service.settings import is_loopback
 from service.store import AlarmEvent, Store, StoreUnavailable
@@ -180,6 +182,7 @@ def create_api(
     *,
     max_streams: int = MAX_STREAMS,
     authenticator: Authenticator | None = None,
+    notifier: Notifier | None = None,
 ) -> FastAPI:
     """Return the HTTP application.
 
@@ -198,7 +201,7 @@ def create_api(
         responses={"default": {"model": models.Problem, "description": "Any error."}},
         dependencies=[Depends(_authorised)],
     )
-    app.state.authenticator = authenticator
+    app.state.authenticator, app.state.notifier = authenticator, notifier
     app.state.access_threads = CapacityLimiter(ACCESS_THREADS)
     app.state.backend = backend
     app.state.probe = Probe(backend.store, authenticator)
@@ -212,6 +215,7 @@ def create_api(
     app.add_exception_handler(RequestValidationError, _validation_handler)
     app.include_router(_feeders)
     app.include_router(_alarms)
+    app.include_router(_notifications)
     app.include_router(_operations)
     app.include_router(_sessions)
     app.mount("/", _Web(directory=_WEB, html=True), name="web")
@@ -806,6 +810,59 @@ def _probe(request: Request, good: bool, reasons: list[str], what: str) -> Any:
 def metrics(backend: BackendHere) -> Response:
     """Metrics in Prometheus's text format."""
     return Response(backend.metrics(), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+# -------------------------------------------------------------- notifications
+
+_notifications = APIRouter(
+    prefix="/api/v1/notifications", tags=["notifications"], dependencies=[Depends(_known_query)]
+)
+
+
+@_notifications.get("")
+def list_targets(request: Request) -> models.Targets:
+    """Targets of notifications, with their position and the problem of the last attempt."""
+    notifier: Notifier | None = request.app.state.notifier
+    return models.Targets(targets=[] if notifier is None else notifier.status())
+
+
+@_notifications.get("/dead-letters")
+def list_dead_letters(
+    request: Request,
+    target: Annotated[str | None, Query(pattern=_NAME, description="Restrict to this target.")] = None,
+    after: Annotated[int, Query(ge=0, le=MAX_EVENT, description="Only letters with a higher number.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+) -> models.Letters:
+    """A page of messages that were given up, oldest first."""
+    notifier: Notifier | None = request.app.state.notifier
+    found = [] if notifier is None else notifier.store.letters(target=target, after=after, limit=limit + 1)
+    page = [
+        models.Letter.model_validate({**asdict(each), "message": json.loads(each.body)})
+        for each in found[:limit]
+    ]
+    return models.Letters(dead_letters=page, next=page[-1].id if len(found) > limit else None)
+
+
+@_notifications.post("/dead-letters/resend", dependencies=[Depends(_json_only)])
+def resend_dead_letters(request: Request, choice: models.LetterChoice) -> models.LetterCount:
+    """Send dead letters again, with the same message ids; a delivered one is deleted."""
+    notifier: Notifier | None = request.app.state.notifier
+    if notifier is None:
+        return models.LetterCount(count=0)
+    count = notifier.store.resend(target=choice.target, ids=choice.ids)
+    notifier.look()
+    return models.LetterCount(count=count)
+
+
+@_notifications.post("/dead-letters/discard", dependencies=[Depends(_json_only)])
+def discard_dead_letters(request: Request, choice: models.LetterChoice) -> models.LetterCount:
+    """Delete dead letters."""
+    notifier: Notifier | None = request.app.state.notifier
+    if notifier is None:
+        return models.LetterCount(count=0)
+    count = notifier.store.discard(target=choice.target, ids=choice.ids)
+    notifier.look()
+    return models.LetterCount(count=count)
 
 
 # ------------------------------------------------------------------- sessions

@@ -86,6 +86,9 @@ Plaintext = Annotated[
         "--plaintext-network", help="Dangerous: zenoh without TLS beyond loopback; any machine can publish."
     ),
 ]
+Notify = Annotated[
+    Path | None, typer.Option(help="File (TOML) with targets of notifications: webhooks, Alertmanager.")
+]
 LogLevel = Annotated[str | None, typer.Option(help="debug, info, warning or error. [default: info]")]
 LogFormat = Annotated[str | None, typer.Option(help="console or json. [default: console]")]
 STOP_S = 2.7
@@ -119,6 +122,7 @@ def serve(
     meter_keys: MeterKeysFile = None,
     unsigned: Unsigned = None,
     plaintext_network: Plaintext = False,
+    notify: Notify = None,
     log_level: LogLevel = None,
     log_format: LogFormat = None,
     until_eof: UntilEof = False,
@@ -163,6 +167,7 @@ def serve(
             "meter_keys": meter_keys,
             "unsigned": unsigned,
             "plaintext_network": plaintext_network or None,
+            "notify": notify,
             "log_level": log_level,
             "log_format": log_format,
         }

@@ -30,6 +30,7 @@ from service.engine.feeder_monitor import FeederMonitor, Phase
 from service.errors import FeederFixed, TooManyFeeders
 from service.ingest.align import Clock
 from service.ingest.queues import Inbox, Sample
+from service.metrics import Metrics
 from service.report import feeder_info
 from service.report.report import FeederReport
 from service.store import OutcomeUnknown, Store, StoreUnavailable
@@ -363,6 +364,11 @@ class Runtime:
         """Return the number of alarm changes that wait for the database, and its problem or None."""
         keeper = self._engine.committer
         return len(keeper.waiting), "; ".join(keeper.problems()) or None
+
+    @property
+    def counters(self) -> Metrics:
+        """Counters and gauges of the service."""
+        return self._engine.metrics
 
     def metrics(self) -> bytes:
         """Return the metrics in Prometheus's text format."""

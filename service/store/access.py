@@ -1,8 +1,8 @@
 """Database of access control: API keys, sessions of the web page, and the audit log.
 
-It is apart from the service's database, since the command line writes it while the service runs. With SQLite
-it is the file `<database>.access`, with PostgreSQL its tables are in the same database. Entries of the audit log
-are appended one at a time, under `BEGIN IMMEDIATE` or an advisory lock of the transaction.
+It is apart from the service's database, since the command line writes it while the service runs: the file
+`<database>.access`, or tables in a PostgreSQL database. Entries of the audit log are appended one at a
+time, under `BEGIN IMMEDIATE` or an advisory lock of the transaction.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Databases beside that of the service, which several processes write: the command line and a running service.
+"""Databases beside that of the service, written by several processes: the command line and a service.
 
 With SQLite such a database is a file of its own, `<database><suffix>`, with a rollback journal: unlike a WAL,
 several processes write it safely. With PostgreSQL its tables are in the service's database.
@@ -138,7 +138,7 @@ def _place(path: Path) -> tuple[int, int]:
 
 
 def _in_place(path: Path, place: tuple[int, int]) -> None:
-    """Give up connections to a removed or replaced file: its contents are not those of the service any more."""
+    """Give up connections to a removed or replaced file: its contents are not the service's."""
     if not path.exists() or _place(path) != place:
         raise sa.exc.DisconnectionError(f"{path} has been removed or replaced")
 
