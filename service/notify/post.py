@@ -14,7 +14,7 @@ import ssl
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv6Address, IPv6Network, ip_address
 from typing import Any, Final
 from urllib.parse import urlsplit
@@ -87,8 +87,9 @@ def post(
     parts = urlsplit(endpoint.url)
     host, secure = parts.hostname or "", parts.scheme == "https"
     path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
+    cancel.begin()
     end = time.monotonic() + endpoint.timeout_s
-    watch = threading.Timer(endpoint.timeout_s, cancel.end)
+    watch = threading.Timer(endpoint.timeout_s, cancel.expire)
     watch.daemon = True
     watch.start()
     try:
@@ -102,11 +103,13 @@ def post(
         finally:
             connection.close()
     except (OSError, http.client.HTTPException, AddressRefused, ValueError) as error:
-        if cancel.ended or isinstance(error, TimeoutError):
-            return Response(None, f"no response within {endpoint.timeout_s:g} s")
-        return Response(None, _text(error))
+        late = cancel.over or isinstance(error, TimeoutError)
+        return Response(None, f"no response within {endpoint.timeout_s:g} s" if late else _text(error))
     finally:
         watch.cancel()
+    if cancel.over:
+        # The end of the connection looks like the end of the response.
+        return Response(None, f"no response within {endpoint.timeout_s:g} s")
     if 200 <= response.status < 300:
         return Response(response.status)
     start = " ".join(text.decode("utf-8", "replace").split())[:200]
@@ -147,27 +150,46 @@ def _within(address: IPv4Address | IPv6Address) -> Iterable[IPv4Address]:
     return [each for each in found if each is not None]
 
 
-@dataclass(slots=True)
 class Cancel:
-    """Ends a request from another thread, at the time limit or at the end of the service."""
+    """Ends requests of one thread from another one: the present one at its time limit, all at the end."""
 
-    ended: bool = False
-    _socket: socket.socket | None = None
-    _lock: threading.Lock = field(default_factory=threading.Lock)
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._ended, self._late = False, False
+        self._socket: socket.socket | None = None
+
+    @property
+    def over(self) -> bool:
+        """True if the present request was ended."""
+        return self._ended or self._late
+
+    def begin(self) -> None:
+        """Begin a request."""
+        with self._lock:
+            self._late, self._socket = False, None
+
+    def expire(self) -> None:
+        """End the present request."""
+        with self._lock:
+            self._late = True
+            self._end()
 
     def end(self) -> None:
-        """End the request in progress and all later ones."""
+        """End the present request and all later ones."""
         with self._lock:
-            self.ended = True
-            if self._socket is not None:
-                _shut(self._socket)
+            self._ended = True
+            self._end()
 
     def hold(self, opened: socket.socket) -> None:
-        """Set the socket of the request in progress."""
+        """Set the socket of the present request."""
         with self._lock:
             self._socket = opened
-            if self.ended:
-                _shut(opened)
+            if self.over:
+                self._end()
+
+    def _end(self) -> None:
+        if self._socket is not None:
+            _shut(self._socket)
 
 
 def _shut(opened: socket.socket) -> None:
