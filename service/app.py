@@ -30,7 +30,7 @@ from service.ingest.align import Clock
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import Bus
 from service.notify.delivery import Notifier
-from service.notify.notices import AlarmSource
+from service.notify.notices import IncidentSource
 from service.notify.targets import Targets, read_targets
 from service.settings import ENV_PREFIX, Settings, SettingsInvalid, is_loopback, split_address
 from service.store import Store
@@ -176,7 +176,7 @@ def _notifier(
     if targets is None:
         return None
     deliveries = stack.enter_context(DeliveryStore(settings.database))
-    notifier = Notifier(targets, AlarmSource(store), deliveries, runtime.counters, wall)
+    notifier = Notifier(targets, IncidentSource(store), deliveries, runtime.counters, wall)
     stack.callback(notifier.close)
     return notifier
 

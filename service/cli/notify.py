@@ -36,9 +36,12 @@ def secret() -> None:
 @app.command()
 def check(file: TargetsFile) -> None:
     """Check a file of targets, and print its targets; no request is made."""
+    from service.notify.targets import Webhook
+
     table = Table("target", "kind", "address", "severities", "kinds", "feeders", "changes")
     for each in _targets(file).all:
-        chosen = (each.severities, each.kinds, each.feeders, each.changes)
+        changes = each.changes if isinstance(each, Webhook) else ()
+        chosen = (each.severities, each.kinds, each.feeders, changes)
         filters = [", ".join(map(str, values)) or "all" for values in chosen]
         table.add_row(*map(escape, (each.name, each.kind, each.host, *filters)))
     console.out.print(table)
@@ -101,9 +104,7 @@ def dead_letters(
             raise typer.BadParameter(f"there is no dead letter {show}")
         print(found.body)
         return
-    table = Table(
-        "letter", "target", "type", "event", "time (UTC)", "given up (UTC)", "attempts", "problem"
-    )
+    table = Table("letter", "target", "type", "event", "time (UTC)", "given up (UTC)", "attempts", "problem")
     for each in letters:
         problem = each.problem + (" (sent again soon)" if each.resend else "")
         row = (str(each.id), each.target, each.type, str(each.number), _when(each.t), _when(each.died))

@@ -1,8 +1,8 @@
 """Alerts of Alertmanager's API v2: https://github.com/prometheus/alertmanager/blob/main/api/v2/openapi.yaml.
 
-Grouping, routing, e-mail, silences and inhibition are Alertmanager's task. An active alarm is sent at its
+Grouping, routing, e-mail, silences and inhibition are Alertmanager's task. An open incident is sent at its
 changes and again every `resend_s`, with an end that lies `HOLD` intervals ahead: if the service ends, the
-alert resolves by itself. A cleared alarm is sent once with its end.
+alert resolves by itself. A cleared, shelved or planned incident is sent once with its end.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any, Final
 
+from service.alarms.incidents import IncidentChange
 from service.alarms.state_machine import Severity
 from service.notify.notices import Notice
 
@@ -20,8 +21,8 @@ HOLD: Final = 4.0
 """Life of an active alert without a further request, in intervals of `resend_s`; as of Prometheus."""
 ALERTS_AT_ONCE: Final = 64
 """Largest number of notices in one request."""
-ESCALATED: Final = "escalated"
-"""Change by which the severity rises."""
+METERS_SHOWN: Final = 50
+"""Largest number of meters in an annotation."""
 _SEVERITIES: Final = tuple(str(each) for each in Severity)
 
 
@@ -40,17 +41,20 @@ def alerts(
     url = f"{external_url.rstrip('/')}/#{notice.feeder}" if external_url else ""
     own = {
         **labels,
-        **notice.labels,
         "alertname": "".join(part.capitalize() for part in notice.kind.split("-")),
         "kind": notice.kind,
         "feeder": notice.feeder,
         "id": notice.subject,
     }
 
+    annotations = {"summary": notice.summary}
+    if notice.meters:
+        annotations["meters"] = ", ".join(notice.meters[:METERS_SHOWN])
+
     def made(severity: str, end: float) -> dict[str, Any]:
         return {
             "labels": {**own, "severity": severity},
-            "annotations": {"summary": notice.summary},
+            "annotations": annotations,
             "startsAt": _rfc3339(notice.began),
             # Alertmanager refuses an alert that ends before its start.
             "endsAt": _rfc3339(max(end, notice.began)),
@@ -58,7 +62,7 @@ def alerts(
         }
 
     found = [made(notice.severity, end)]
-    if notice.change == ESCALATED:
+    if notice.change == IncidentChange.ESCALATED:
         lower = _SEVERITIES[_SEVERITIES.index(notice.severity) + 1 :]
         # The severity is a label: without its end the earlier alert would stay until its time limit.
         found += [made(severity, notice.t) for severity in lower]

@@ -7,9 +7,9 @@
     url = "https://hooks.example/gridsec"
     secret = "whsec_..."                      # or secret_file = "/run/credentials/dispatch"
     severities = ["critical", "major"]        # these filters are optional
-    kinds = ["meter-manipulated"]
+    kinds = ["manipulation"]
     feeders = ["village"]
-    changes = ["raised", "cleared"]
+    changes = ["opened", "cleared"]           # default: begin and end, escalation, end of a suppression
 
     [[alertmanager]]
     name = "control-room"
@@ -32,8 +32,9 @@ from urllib.parse import urlsplit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from gridsec.errors import InputInvalid, Problem
-from service.alarms.state_machine import AlarmKind, Change, Severity
-from service.notify.notices import Notice
+from service.alarms.incidents import IncidentChange, IncidentKind
+from service.alarms.state_machine import Severity
+from service.notify.notices import MAIN_CHANGES, Notice
 from service.notify.post import Endpoint
 from service.notify.webhook import secret_bytes
 
@@ -57,9 +58,8 @@ class Target(BaseModel):
     timeout_s: Annotated[float, Field(ge=0.1, le=60.0, allow_inf_nan=False)] = 10.0
     give_up_s: _Positive = 3600.0
     severities: tuple[Severity, ...] = ()
-    kinds: tuple[AlarmKind, ...] = ()
+    kinds: tuple[IncidentKind, ...] = ()
     feeders: tuple[_FEEDER, ...] = ()
-    changes: tuple[Change, ...] = ()
 
     @field_validator("name")
     @classmethod
@@ -109,7 +109,6 @@ class Target(BaseModel):
             (self.severities, notice.severity),
             (self.kinds, notice.kind),
             (self.feeders, notice.feeder),
-            (self.changes, notice.change),
         )
         return all(not allowed or value in allowed for allowed, value in chosen)
 
@@ -120,6 +119,11 @@ class Webhook(Target):
     type: Literal["webhook"] = Field(default="webhook", exclude=True)
     secret: str | None = Field(default=None, repr=False)
     secret_file: Path | None = None
+    changes: Annotated[tuple[IncidentChange, ...], Field(min_length=1)] = MAIN_CHANGES
+
+    def selects(self, notice: Notice) -> bool:
+        """True if a notice is sent: of the chosen changes, those that are not suppressed."""
+        return notice.notify and notice.change in self.changes and super().selects(notice)
 
     @model_validator(mode="after")
     def _signed(self) -> Self:
@@ -159,13 +163,6 @@ class Alertmanager(Target):
             text = f"{', '.join(wrong)}: letters, digits and _, not a digit first"
             raise InputInvalid([Problem("wrong-name", text)])
         return value
-
-    @model_validator(mode="after")
-    def _all_changes(self) -> Self:
-        if self.changes:
-            text = "changes is not for Alertmanager: an alert without its end would stay active"
-            raise InputInvalid([Problem("inconsistent", text)])
-        return self
 
 
 class Targets(BaseModel):

@@ -16,7 +16,7 @@ import pytest
 from service.alarms.state_machine import AlarmState, AlarmTransition, Change, Severity
 from service.notify import alertmanager
 from service.notify.delivery import Delivery, channel_of
-from service.notify.notices import AlarmSource, trial_notice
+from service.notify.notices import IncidentSource, trial_notice
 from service.notify.targets import Alertmanager
 from service.store import Store
 from service.store.deliveries import DeliveryStore
@@ -80,17 +80,18 @@ def test_alerts_follow_the_alarms(tmp_path: Path, manager: str, page: Receiver) 
     )  # fmt: skip
     with Store(url) as store, DeliveryStore(url) as kept:
         channel = channel_of(target, "https://grid.example")
-        delivery = Delivery(channel, AlarmSource(store), kept, None, random=lambda: 0.5)
+        delivery = Delivery(channel, IncidentSource(store), kept, None, random=lambda: 0.5)
         begun = time.time()
         alarm = an_alarm(1, t_event=begun - 2.0, t_raised=begun, meter="m01")
         store.commit([raised(alarm)])
         delivery.step(begun)
         (found,) = until(lambda: alerts(manager), "the alert").values()
         assert found["labels"] == {
-            "alertname": "MeterManipulated", "kind": "meter-manipulated", "feeder": "village",
-            "meter": "m01", "severity": "critical", "id": alarm.id, "site": "north",
+            "alertname": "Manipulation", "kind": "manipulation", "feeder": "village",
+            "severity": "critical", "id": store.incidents()[0][0].id, "site": "north",
         }  # fmt: skip
-        assert found["annotations"] == {"summary": f"village, m01: {alarm.reason}"}
+        summary = f"village: manipulation: {alarm.reason}"
+        assert found["annotations"] == {"summary": summary, "meters": "m01"}
         assert found["generatorURL"] == "https://grid.example/#village"
         until(lambda: page.got, "Alertmanager's notification")
         first_end = found["endsAt"]
@@ -130,10 +131,11 @@ def test_a_refused_alert_does_not_take_others_with_it(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/g.db"
     with receiving() as receiver, Store(url) as store, DeliveryStore(url) as kept:
         target = Alertmanager(name="am", url=receiver.url, private_addresses=True)
-        delivery = Delivery(channel_of(target, ""), AlarmSource(store), kept, None, random=lambda: 0.5)
+        delivery = Delivery(channel_of(target, ""), IncidentSource(store), kept, None, random=lambda: 0.5)
         receiver.answers.extend([400, 400, 400])
         now = time.time()
-        store.commit([raised(an_alarm(k, t_event=now, t_raised=now)) for k in (1, 2, 3)])
+        times = {"t_event": now, "t_raised": now}
+        store.commit([raised(an_alarm(k, feeder=f"feeder-{k}", **times)) for k in (1, 2, 3)])
         for _ in range(40):
             now = max(delivery.step(now), now + 0.1)
         assert [each.number for each in kept.letters()] == [1]

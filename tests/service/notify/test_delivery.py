@@ -32,7 +32,7 @@ from service.notify.delivery import (
     backoff_s,
     channel_of,
 )
-from service.notify.notices import AlarmSource
+from service.notify.notices import IncidentSource
 from service.notify.post import Cancel
 from service.notify.targets import Targets, Webhook
 from service.notify.webhook import secret_bytes, signature
@@ -88,7 +88,7 @@ class Course:
         stored = self.kept.positions().get(self.target.name)
         self.delivery = Delivery(
             channel_of(self.target, ""),
-            AlarmSource(self.store),
+            IncidentSource(self.store),
             self.kept,
             stored,
             random=lambda: 0.5,
@@ -119,8 +119,9 @@ def numbers(receiver: Receiver) -> list[int]:
 
 
 def raise_some(store: Store, *which: int) -> None:
+    """Raise alarms, each of a feeder of its own: each opens an incident."""
     for number in which:
-        store.commit([raised(an_alarm(number))])
+        store.commit([raised(an_alarm(number, feeder=f"feeder-{number}"))])
 
 
 # ------------------------------------------------------------------------------------------------- messages
@@ -131,12 +132,12 @@ def test_a_message_is_signed_and_has_the_event(course: Course, receiver: Receive
     course.run(1.0)
     (got,) = receiver.got
     message = json.loads(got.body)
-    assert (message["type"], message["timestamp"]) == ("alarm.raised", "2026-11-20T22:00:01.000Z")
-    event = message["data"]
-    assert (event["seq"], event["change"], event["alarm"]["id"]) == (2, "raised", an_alarm(1).id)
-    assert event["alarm"]["evidence"]["attack_volt_estimated"] == -5e-324
+    assert (message["type"], message["timestamp"]) == ("incident.opened", "2026-11-20T22:00:01.000Z")
+    event, (incident,) = message["data"], course.store.incidents(feeder="feeder-1")[0]
+    assert (event["seq"], event["change"], event["incident"]["id"]) == (2, "opened", incident.id)
+    assert (event["incident"]["meters"], event["incident"]["reason"]) == (["m1"], an_alarm(1).reason)
     name, when = got.headers["webhook-id"], got.headers["webhook-timestamp"]
-    assert name == f"msg_{an_alarm(1).id}_2"
+    assert name == f"msg_{incident.id}_2"
     assert T0 <= float(when) <= T0 + 1.0
     assert got.headers["webhook-signature"] == f"v1,{signature(KEY, name, when, got.body)}"
 
@@ -148,7 +149,7 @@ def test_a_new_target_begins_after_the_newest_event(course: Course, receiver: Re
 
 
 def test_filters_select_and_move_the_position(receiver: Receiver, store: Store, kept: DeliveryStore) -> None:
-    target = hook(receiver, severities=["major"], kinds=["data-loss"], feeders=["town"], changes=["raised"])
+    target = hook(receiver, severities=["major"], kinds=["data-loss"], feeders=["town"], changes=["opened"])
     course = Course(target, store, kept)
     wanted = an_alarm(1, kind=AlarmKind.DATA_LOSS, severity=Severity.MAJOR, feeder="town")
     wrong: tuple[dict[str, Any], ...] = (
@@ -157,7 +158,9 @@ def test_filters_select_and_move_the_position(receiver: Receiver, store: Store, 
         {"feeder": "village"},
     )
     for k, changes in enumerate(wrong):
-        store.commit([raised(replace(wanted, id=f"{k:026d}", **changes))])
+        # Hours before: no common incident.
+        early = {"t_event": T0 - 7200.0 * (k + 1), "t_raised": T0 - 7200.0 * (k + 1)}
+        store.commit([raised(replace(wanted, id=f"{k + 2:026d}", **early, **changes))])
     store.commit([raised(wanted)])
     cleared = replace(wanted, state=AlarmState.CLEARED, t_cleared=T0 + 9.0)
     store.commit([AlarmTransition(cleared, Change.CLEARED, T0 + 9.0)])
@@ -257,7 +260,7 @@ def test_messages_to_a_target_that_stays_down_are_given_up_by_age(course: Course
     receiver.always = 503
     raise_some(course.store, 1, 2)
     course.run(course.target.give_up_s + 2.0 * BACKOFF_MOST_S)
-    young = an_alarm(3, t_raised=course.now)
+    young = an_alarm(3, t_event=course.now, t_raised=course.now, feeder="feeder-3")
     course.store.commit([raised(young)])
     course.run(10.0 * BACKOFF_MOST_S)
     letters = course.kept.letters()
@@ -323,7 +326,7 @@ def test_kill_minus_9_loses_no_message(tmp_path: Path, receiver: Receiver) -> No
 import sys, time
 from service.store import Store
 from service.notify.delivery import Notifier
-from service.notify.notices import AlarmSource
+from service.notify.notices import IncidentSource
 from service.notify.targets import Targets
 from service.metrics import Metrics
 from service.store.deliveries import DeliveryStore
@@ -331,11 +334,11 @@ from tests.service.stored import an_alarm, raised
 url, hook, first = sys.argv[1], sys.argv[2], int(sys.argv[3])
 with Store(url) as store, DeliveryStore(url) as kept:
     target = {"name": "hook", "url": hook, "secret": "SECRET", "private_addresses": True}
-    notifier = Notifier(Targets.model_validate({"webhook": [target]}), AlarmSource(store), kept, Metrics())
+    notifier = Notifier(Targets.model_validate({"webhook": [target]}), IncidentSource(store), kept, Metrics())
     notifier.start()
     for k in range(first, first + 1000):
-        store.commit([raised(an_alarm(k))])
-        print(store.last_event, flush=True)
+        store.commit([raised(an_alarm(k, feeder=f"feeder-{k}"))])
+        print(store.last_incident_event, flush=True)
         notifier.wake()
         time.sleep(0.01)
 """.replace("SECRET", SECRET)
@@ -352,7 +355,7 @@ with Store(url) as store, DeliveryStore(url) as kept:
             # Lines that were written before the end.
             stored = max([stored, *map(int, child.stdout.read().split())])
     with Store(f"sqlite:///{tmp_path}/g.db") as store, DeliveryStore(f"sqlite:///{tmp_path}/g.db") as kept:
-        last = store.last_event
+        last = store.last_incident_event
         course = Course(hook(receiver), store, kept)
         course.run(30.0)
     assert last >= stored
@@ -373,7 +376,7 @@ def test_a_target_that_does_not_answer_delays_no_other(
         stuck.answers.append(lambda _: release.wait(20.0) and None)
         targets = Targets(webhook=(hook(stuck, name="stuck"), hook(receiver, name="good")))
         metrics = Metrics()
-        notifier = Notifier(targets, AlarmSource(store), kept, metrics)
+        notifier = Notifier(targets, IncidentSource(store), kept, metrics)
         notifier.start()
         try:
             raise_some(store, 1, 2)
@@ -406,7 +409,7 @@ def test_an_unexpected_error_ends_no_thread(
     monkeypatch.setattr(Delivery, "step", fail)
     monkeypatch.setattr("service.notify.delivery.DEFECT_S", 0.01)
     monkeypatch.setattr("service.notify.delivery.POLL_S", 0.01)
-    notifier = Notifier(Targets(webhook=(hook(receiver),)), AlarmSource(store), kept, Metrics())
+    notifier = Notifier(Targets(webhook=(hook(receiver),)), IncidentSource(store), kept, Metrics())
     notifier.start()
     try:
         raise_some(store, 1)

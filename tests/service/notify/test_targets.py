@@ -92,7 +92,7 @@ url = "ftp://x"
         (f'[[webhook]]\nname = "a"\nurl = "https://a.example:99999"\nsecret = "{SECRET}"', "wrong-address"),
         (f'[[webhook]]\nname = "a"\nurl = "https://a.example"\nsecret = "{SECRET}"\n' * 2, "duplicate"),
         ('[[alertmanager]]\nname = "a"\nurl = "https://a.example"\nlabels = { "a-b" = "c" }', "wrong-name"),
-        ('[[alertmanager]]\nname = "a"\nurl = "https://a.example"\nchanges = ["cleared"]', "inconsistent"),
+        ('[[alertmanager]]\nname = "a"\nurl = "https://a.example"\nchanges = ["cleared"]', "unknown-name"),
         ('[[alertmanager]]\nname = "a"\nurl = "https://a.example"\nca_file = "/absent"', "no-file"),
         (
             "".join(f'[[alertmanager]]\nname = "a{k}"\nurl = "https://a.example"\n' for k in range(17)),
