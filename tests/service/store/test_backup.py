@@ -22,6 +22,7 @@ from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import MeterClient
 from service.store import Store, StoreUnavailable
 from service.store.backup import backup, restore
+from service.store.deliveries import DeliveryStore, Position
 from tests.service.databases import Cluster, both
 from tests.service.running import FEEDER, free_port, until
 from tests.service.stored import T0, a_report, an_alarm, raised
@@ -143,6 +144,17 @@ def test_keys_and_audit_log_go_along(tmp_path: Path) -> None:
     Path(f"{database}.access").unlink()
     backup(f"sqlite:///{database}", file)
     assert not Path(f"{file}.access").exists()
+
+
+def test_positions_of_notifications_go_along(tmp_path: Path) -> None:
+    database, file = f"sqlite:///{tmp_path}/g.db", tmp_path / "backup"
+    Store(database).close()
+    with DeliveryStore(database) as store:
+        store.keep("hook", Position(7))
+    assert [copy.name for copy in backup(database, file)] == [str(file), f"{file}.notify"]
+    restore(f"sqlite:///{tmp_path}/new.db", file)
+    with DeliveryStore(f"sqlite:///{tmp_path}/new.db") as store:
+        assert store.positions() == {"hook": Position(7)}
 
 
 def test_what_is_no_backup_is_refused(tmp_path: Path) -> None:
