@@ -21,7 +21,7 @@ from service.cli.simulate import Pace, play
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import MeterClient
 from service.store import Store, StoreUnavailable
-from service.store.backup import backup, restore
+from service.store.backup import NEWEST, backup, restore
 from tests.service.databases import Cluster, both
 from tests.service.running import FEEDER, free_port, until
 from tests.service.stored import T0, a_report, an_alarm, raised
