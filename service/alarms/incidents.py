@@ -494,7 +494,7 @@ class _Work:
             reason=alarm.reason if first else incident.reason,
             count=incident.count + 1,
             kinds=_with(incident.kinds, alarm.kind),
-            meters=_with(incident.meters, alarm.meter),
+            meters=_with(incident.meters, alarm.meter, *alarm.evidence.silent),
             customers=_with(incident.customers, alarm.customer),
             t_first=min(incident.t_first, alarm.t_event),
             t_last=max(incident.t_last, alarm.t_raised),
@@ -670,8 +670,9 @@ def applies(shelf: Shelf, alarm: str, member: Member) -> bool:
     )
 
 
-def _with(known: tuple[T, ...], one: T | None) -> tuple[T, ...]:
-    return known if one is None or one in known else (*known, one)
+def _with(known: tuple[T, ...], *more: T | None) -> tuple[T, ...]:
+    found = dict.fromkeys((*known, *(one for one in more if one is not None)))
+    return known if len(found) == len(known) else tuple(found)
 
 
 def _counted(incident: Incident, old: Member | None, now: Member) -> Incident:

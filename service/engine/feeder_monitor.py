@@ -23,12 +23,13 @@ from feeders.registry import DesignedEstimator, WarmStart
 from gridsec.estimators.sequential import SuspicionRecord
 from gridsec.interface import Cause
 from service.alarms.conditions import conditions
-from service.alarms.state_machine import AlarmBook, AlarmRules, AlarmTransition, advance, hold
+from service.alarms.state_machine import INCIDENT_S, AlarmBook, AlarmRules, AlarmTransition, advance, hold
 from service.engine.commissioning import FeederCommissioning
 from service.ingest.align import Aligner, AlignRules, Clock, ReadingOutcome, Tick, rules
 from service.ingest.reading import Known, Reading
 from service.report import feeder_info
 from service.report.report import (
+    BUSBAR,
     DataErrors,
     FeederReport,
     blind,
@@ -151,7 +152,12 @@ def align_rules(
 def alarm_rules(site: Site, times: AlignRules) -> AlarmRules:
     """Return the delays of a feeder's alarms."""
     settings = site.tables.meta.monitor
-    return AlarmRules(settings.on_delay_s, settings.off_delay_s, silence_s=times.silence_s)
+    return AlarmRules(
+        settings.on_delay_s,
+        settings.off_delay_s,
+        silence_s=times.silence_s,
+        incident_s=max(INCIDENT_S, 2.0 * times.tick_s),
+    )
 
 
 def design(site: Site, progress: Callable[[int, int], None] | None = None) -> registry.DesignedEstimator:
@@ -201,6 +207,8 @@ class FeederMonitor:
         self._alarm_rules = alarm_rules(site, rules)
         self._data_errors = DataErrors(site)
         self._power_ages = PowerAges(site)
+        # Meters that have had no reading since the start and are not silent yet.
+        self._connecting = {BUSBAR, *site.meter_ids}
         self._watcher: registry.DesignedEstimator | None = None
         self._state: Any = None
 
@@ -287,7 +295,8 @@ class FeederMonitor:
         for _ in range(2):  # monitored, then failed
             try:
                 report = self._complete(self._judge(tick))
-                after, transitions = advance(book, self._alarm_rules, conditions(report), report.t)
+                found = conditions(report, connecting=self._connects(report))
+                after, transitions = advance(book, self._alarm_rules, found, report.t)
             except Exception as error:  # noqa: BLE001 - ticks before and after keep their verdicts
                 self.break_down(error)
             else:
@@ -295,6 +304,15 @@ class FeederMonitor:
                 return TickResult(report, transitions)
         self.report = self._complete(self._judge(tick))
         return TickResult(self.report, ())
+
+    def _connects(self, report: FeederReport) -> bool:
+        """True while a meter has had no reading since the start and is not silent yet."""
+        if self._connecting:
+            self._connecting -= {meter.meter for meter in report.meters if meter.seen}
+            self._connecting -= {one.meter for one in report.silent}
+            if report.busbar.seen:
+                self._connecting.discard(BUSBAR)
+        return bool(self._connecting)
 
     def _complete(self, report: FeederReport) -> FeederReport:
         """The report with its feeder's revision, the newest tick with a reading, and the verdict's start."""

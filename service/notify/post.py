@@ -129,7 +129,7 @@ def permitted(
     if not good:
         texts = ", ".join(sorted({str(each[4][0]) for each in found}))
         raise AddressRefused(
-            f"{host} is {texts}, not a public address; `private_addresses = true` of the target permits it"
+            f"{host} has no public address ({texts}); `private_addresses = true` of the target permits it"
         )
     return good
 

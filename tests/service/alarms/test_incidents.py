@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -162,7 +163,7 @@ def test_acknowledging_all_withdrawing_one_and_raising_another() -> None:
 
 
 def test_a_comment_on_an_alarm_changes_no_incident() -> None:
-    book, happened = run(raised(alarm(1)), commented(alarm(1), "Ada", "seen", T0 + 1))
+    _book, happened = run(raised(alarm(1)), commented(alarm(1), "Ada", "seen", T0 + 1))
     assert changes(happened) == [C.OPENED]
 
 
@@ -347,7 +348,7 @@ def test_numbers_follow_the_alarms_and_commits_do_not_matter(
     transitions = course(steps)
     whole, _ = run(*transitions)
     parts, book = sorted({0, *cuts, len(transitions)}), IncidentBook("village")
-    for begin, end in zip(parts, parts[1:], strict=False):
+    for begin, end in itertools.pairwise(parts):
         book, _ = advance(book, transitions[begin:end], T0)
     assert book == whole
     newest = {item.alarm.id: item.alarm for item in transitions}
@@ -376,7 +377,7 @@ def test_every_opening_has_one_end(steps: list[tuple[int, float, str]]) -> None:
         own = [item for item in happened if item.incident.id == name]
         ends = [item.change for item in own if item.change in {C.OPENED, C.REOPENED, C.CLEARED}]
         assert ends[0] is C.OPENED
-        assert all((one is C.CLEARED) != (two is C.CLEARED) for one, two in zip(ends, ends[1:], strict=False))
+        assert all((one is C.CLEARED) != (two is C.CLEARED) for one, two in itertools.pairwise(ends))
         assert (ends[-1] is C.CLEARED) is not incident.open
         for item in own:
             assert (item.change is C.CLEARED) <= (not item.incident.open)

@@ -21,7 +21,7 @@ from service.cli.simulate import Pace, play
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import MeterClient
 from service.store import Store, StoreUnavailable
-from service.store.backup import backup, restore
+from service.store.backup import NEWEST, backup, restore
 from service.store.deliveries import DeliveryStore, Position
 from tests.service.databases import Cluster, both
 from tests.service.running import FEEDER, free_port, until
