@@ -96,6 +96,7 @@ async def serve(
             max_payload=settings.max_payload,
             max_samples=settings.queue,
             max_feeders=settings.max_feeders,
+            shelve_most_s=3600.0 * settings.max_shelve_h,
             meter_keys=meter_keys,
         )
         runtime = Runtime(

@@ -119,7 +119,8 @@ def conditions(report: FeederReport, *, connecting: bool = False) -> list[Condit
       manipulated meter raises none. Unknown while the interval contains a limit with its middle outside, or
       while the reconstruction has no guarantee or is model only.
     - `data-loss`: a meter, or the busbar meter, is silent. Unknown while it is unavailable but not yet
-      silent. If most meters are silent, there is one condition of the feeder, and those of meters are unknown.
+      silent. If most meters are silent, there is one condition of the feeder, and those of meters are
+      unknown.
     - `undecided`: there is no verdict, for a separate cause. Unknown while the monitor settles, while meters
       connect, or if `data-loss` gives the reason: every meter without a reading is silent.
     - `learning-stalled`: the fixed error of a meter is not learned after twice the expected time; one

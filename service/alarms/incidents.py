@@ -228,6 +228,12 @@ class WorkUnknown(GridsecError):
         super().__init__(f"no planned work has the id {work_id!r}")
 
 
+class WrongTime(GridsecError):
+    """The time of a shelf or of planned work is outside of its limits."""
+
+    code = "wrong-time"
+
+
 @dataclass(frozen=True, slots=True)
 class Shelf:
     """Suppression of the notifications of alarms. Times are Unix seconds.
@@ -376,7 +382,7 @@ def due(book: IncidentBook) -> float | None:
     return min(times, default=None)
 
 
-_GREW = frozenset({IncidentChange.EXTENDED, IncidentChange.ESCALATED, IncidentChange.UPDATED})
+_GREW = frozenset({IncidentChange.EXTENDED, IncidentChange.ESCALATED})
 _BASES = frozenset(
     {
         IncidentChange.OPENED,
@@ -640,6 +646,9 @@ class _Work:
             if change in _GREW and last.change in _BASES:
                 escalated = change is IncidentChange.ESCALATED and last.change is IncidentChange.EXTENDED
                 self.happened[place] = replace(new, change=change if escalated else last.change)
+                return
+            if change is IncidentChange.UPDATED and t is not None:
+                self.happened[place] = replace(last, incident=incident, notify=incident.notify)
                 return
             if last.change is IncidentChange.UPDATED and t is not None:
                 self.happened[place] = new

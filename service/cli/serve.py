@@ -52,6 +52,9 @@ Grace = Annotated[
 ]
 MaxPayload = Annotated[int | None, typer.Option(help="Largest payload, bytes. [default: 262144]")]
 Queue = Annotated[int | None, typer.Option(help="Length of the queue, payloads. [default: 20000]")]
+MaxShelve = Annotated[
+    float | None, typer.Option("--max-shelve", help="Longest time of a shelf of alarms, h. [default: 24]")
+]
 MaxFeeders = Annotated[int | None, typer.Option(help="Largest number of feeders over REST. [default: 100]")]
 OidcIssuer = Annotated[
     str | None, typer.Option(help="Issuer of bearer tokens (OpenID Connect), e.g. https://login.example.")
@@ -114,6 +117,7 @@ def serve(
     max_payload: MaxPayload = None,
     queue: Queue = None,
     max_feeders: MaxFeeders = None,
+    max_shelve: MaxShelve = None,
     oidc_issuer: OidcIssuer = None,
     oidc_audience: OidcAudience = None,
     oidc_jwks: OidcJwks = None,
@@ -159,6 +163,7 @@ def serve(
             "max_payload": max_payload,
             "queue": queue,
             "max_feeders": max_feeders,
+            "max_shelve_h": max_shelve,
             "oidc_issuer": oidc_issuer,
             "oidc_audience": oidc_audience,
             "oidc_jwks": oidc_jwks,

@@ -392,6 +392,15 @@ class IncidentReader:
         with self._read() as connection:
             return [_event(row) for row in connection.execute(query).mappings()]
 
+    def open_incident_events(self) -> list[IncidentEvent]:
+        """Return the newest event of each open incident."""
+        e, i = INCIDENT_EVENT.c, INCIDENT.c
+        open_ones = sa.select(i.id).where(i.state != str(IncidentState.CLEARED))
+        newest = sa.select(sa.func.max(e.seq)).where(e.incident_id.in_(open_ones)).group_by(e.incident_id)
+        with self._read() as connection:
+            rows = connection.execute(sa.select(INCIDENT_EVENT).where(e.seq.in_(newest)).order_by(e.seq))
+            return [_event(row) for row in rows.mappings()]
+
     def incidents_unpublished(self, *, after: int = 0, limit: int = 1000) -> list[IncidentEvent]:
         """Return the events of incidents that are not published on zenoh, oldest first."""
         e = INCIDENT_EVENT.c
@@ -468,21 +477,21 @@ class IncidentReader:
             return [kind.validate_json(data) for data in connection.scalars(query)]
 
     def said(self, since: float, *, among: Collection[str] | None = None, limit: int = 1000) -> list[Said]:
-        """Return the newest comments of operators at or after a time (Unix s), oldest first."""
-        found: list[Said] = []
+        """Return the newest comments of operators at or after a time (Unix s), oldest first.
+
+        An action on several alarms with one comment is one of them: that of their incident, if it has one.
+        """
+        found: dict[tuple[object, ...], Said] = {}
         with self._read() as connection:
-            for table in (EVENT, INCIDENT_EVENT):
+            for table in (INCIDENT_EVENT, EVENT):
                 c = table.c
-                query = sa.select(table).where(c.t >= since, c.who.is_not(None), c.comment.is_not(None))
-                if table is INCIDENT_EVENT:
-                    # The acknowledgement of an alarm carries the same comment.
-                    answers = (IncidentChange.ACKNOWLEDGED, IncidentChange.UNACKNOWLEDGED)
-                    query = query.where(c.change.not_in([str(change) for change in answers]))
+                query = sa.select(table).where(c.t >= since, c.who.is_not(None), c.comment != "")
                 if among is not None:
                     query = query.where(c.feeder.in_(among))
                 rows = connection.execute(query.order_by(c.seq.desc()).limit(limit)).mappings()
-                found += [_said(row) for row in rows if row["comment"]]
-        return sorted(found, key=lambda one: one.t)[-limit:]
+                for one in map(_said, rows):
+                    found.setdefault((one.t, one.feeder, one.who, one.change, one.comment), one)
+        return sorted(found.values(), key=lambda one: one.t)[-limit:]
 
 
 def _said(row: sa.RowMapping) -> Said:
