@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Annotated
@@ -32,6 +32,7 @@ class AlarmKind(StrEnum):
     UNDECIDED = "undecided"
     LEARNING_STALLED = "learning-stalled"
     CLOCK_OFFSET = "clock-offset"
+    IDENTITY_MISMATCH = "identity-mismatch"
 
 
 class Severity(StrEnum):
@@ -343,6 +344,20 @@ def _undecided(report: FeederReport, *, connecting: bool) -> Iterable[Condition]
         and report.cause is not Cause.SETTLING,
         unheard=unheard,
     )
+
+
+def identity_mismatches(feeder: str, refused: Mapping[str, str]) -> list[Condition]:
+    """Return the conditions of meters with readings of another identity.
+
+    refused: the latest problem by meter, of readings that were refused for their signature or their sender.
+    """
+    kind, severity = AlarmKind.IDENTITY_MISMATCH, Severity.MAJOR
+    return [
+        Condition(
+            kind, feeder, meter, severity, reason=f"readings of another identity are refused: {problem}"
+        )
+        for meter, problem in sorted(refused.items())
+    ]
 
 
 def _clocks(report: FeederReport) -> Iterable[Condition]:

@@ -34,6 +34,7 @@ class IncidentKind(StrEnum):
     """Cause of an incident, in descending order of precedence."""
 
     MANIPULATION = "manipulation"
+    IDENTITY_MISMATCH = "identity-mismatch"
     DATA_LOSS = "data-loss"
     VOLTAGE_LIMIT = "voltage-limit"
     UNDECIDED = "undecided"

@@ -55,7 +55,7 @@ from service.ingest.reading import (
     head_of,
 )
 from service.metrics import Metrics
-from service.report.report import FeederReport, to_text
+from service.report.report import BUSBAR, FeederReport, to_text
 from service.store import Rejected, Store
 from service.store.committer import Committer, Executor, Wish, alarm_key, incident_key, inline
 from service.store.schema import CommissioningEvent
@@ -412,6 +412,7 @@ class Engine:
                 break
             decoded = self._decode(sample)
             bad.extend(self._note(problem, sample) for problem in decoded.bad)
+            self._refuse_identities(decoded.bad)
             for reading in decoded.readings:
                 monitor = self.monitors[reading.feeder]
                 lost.setdefault(monitor.name, monitor.aligner.lost)
@@ -426,6 +427,17 @@ class Engine:
         for name, before in lost.items():
             self.metrics.lost.labels(name).inc(self.monitors[name].aligner.lost - before)
         return bad
+
+    def _refuse_identities(self, bad: Iterable[BadReading]) -> None:
+        """Pass readings with a wrong signature or sender to the monitors of their feeders."""
+        for problem in bad:
+            monitor = self.monitors.get(problem.feeder or "")
+            if problem.reason is not BadReason.SIGNATURE or monitor is None:
+                continue
+            # The last entry of a long batch has no meter; those before it have.
+            meter = problem.meter or (BUSBAR if "/substation/" in problem.key else None)
+            if meter is not None:
+                monitor.refuse(meter, problem.problems[0])
 
     def _judge(self) -> list[TickResult]:
         """Evaluate the pending ticks within the time budget; count skipped ones."""

@@ -22,7 +22,7 @@ from feeders.model.site import PowerAges, Site, to_frame
 from feeders.registry import DesignedEstimator, WarmStart
 from gridsec.estimators.sequential import SuspicionRecord
 from gridsec.interface import Cause
-from service.alarms.conditions import conditions
+from service.alarms.conditions import conditions, identity_mismatches
 from service.alarms.state_machine import INCIDENT_S, AlarmBook, AlarmRules, AlarmTransition, advance, hold
 from service.engine.commissioning import FeederCommissioning
 from service.ingest.align import Aligner, AlignRules, Clock, ReadingOutcome, Tick, rules
@@ -106,6 +106,8 @@ class Suspicions:
 POWER_MAX_FACTOR = 100.0
 """Largest plausible power over the feeder's base power."""
 
+MISMATCH_S = 60.0
+"""Time for which a refused identity is a condition, s; at least two ticks."""
 PATIENCE_MIN_S = 5.0
 """Lower limit of `patience_s`, s."""
 
@@ -209,6 +211,9 @@ class FeederMonitor:
         self._power_ages = PowerAges(site)
         # Meters that have had no reading since the start and are not silent yet.
         self._connecting = {BUSBAR, *site.meter_ids}
+        # Problems of refused identities by meter: since the last tick, and with the tick of the latest one.
+        self._refused: dict[str, str] = {}
+        self._mismatches: dict[str, tuple[float, str]] = {}
         self._watcher: registry.DesignedEstimator | None = None
         self._state: Any = None
 
@@ -248,6 +253,23 @@ class FeederMonitor:
         outcome, ticks = self.aligner.take(reading, now)
         self.pending.extend(ticks)
         return outcome
+
+    def refuse(self, meter: str, problem: str) -> None:
+        """Note a reading that was refused for its identity; a condition from the next tick on."""
+        self._refused[meter] = problem
+
+    def _mismatched(self, t: float) -> dict[str, str]:
+        """Problems of refused identities within the last `MISMATCH_S` before a tick, by meter."""
+        self._mismatches |= {meter: (t, problem) for meter, problem in self._refused.items()}
+        self._refused.clear()
+        hold_s = max(MISMATCH_S, 2.0 * self.aligner.rules.tick_s)
+        # After the clock was set back, a later time would hold the condition for longer.
+        self._mismatches = {
+            meter: (at, problem)
+            for meter, (at, problem) in self._mismatches.items()
+            if 0.0 <= t - at <= hold_s
+        }
+        return {meter: problem for meter, (_, problem) in self._mismatches.items()}
 
     def reach(self, now: float) -> None:
         """Add the ticks that are due without a new reading to the pending ones."""
@@ -292,10 +314,11 @@ class FeederMonitor:
         book = self.book
         if tick.skipped:
             book = hold(book, tick.t - tick.skipped * self.aligner.rules.tick_s)
+        mismatches = identity_mismatches(self.name, self._mismatched(tick.t))
         for _ in range(2):  # monitored, then failed
             try:
                 report = self._complete(self._judge(tick))
-                found = conditions(report, connecting=self._connects(report))
+                found = [*conditions(report, connecting=self._connects(report)), *mismatches]
                 after, transitions = advance(book, self._alarm_rules, found, report.t)
             except Exception as error:  # noqa: BLE001 - ticks before and after keep their verdicts
                 self.break_down(error)
