@@ -114,6 +114,7 @@ class Incident:
     ] = None
     t_acknowledged: float | None = None
     assigned_to: str | None = None
+    comments: Annotated[int, Field(description="Number of comments on the incident.")] = 0
     shelved_until: Annotated[
         float | None, Field(description="End of the shelf of all its active alarms; null without one.")
     ] = None
@@ -541,7 +542,8 @@ class _Work:
                 found = replace(self._known(action.incident), assigned_to=action.to)
                 self._say(found, IncidentChange.ASSIGNED, action.who, action.comment)
             case Comment():
-                found = self._known(action.incident)
+                known = self._known(action.incident)
+                found = replace(known, comments=known.comments + 1)
                 self._say(found, IncidentChange.COMMENTED, action.who, action.comment)
             case Shelf():
                 self.shelves[action.id] = action

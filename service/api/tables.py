@@ -85,6 +85,7 @@ _INCIDENTS: dict[str, Any] = {
     "acknowledged_by": _TEXT,
     "t_acknowledged": _TIME,
     "assigned_to": _TEXT,
+    "comments": pa.int64(),
     "shelved_until": _TIME,
     "planned_work": _TEXT,
     "planned_until": _TIME,

@@ -31,7 +31,7 @@ function hint({ data_error: error }) {
 }
 
 export class Alarms {
-  constructor({ onPick, onLink }) {
+  constructor({ onPick, onLink, onChange = () => {} }) {
     this.alarms = new Map();
     this.items = new Map();
     this.loading = 0;
@@ -41,6 +41,7 @@ export class Alarms {
     this.turn = 0;
     this.onPick = onPick;
     this.onLink = onLink;
+    this.onChange = onChange; // Called after each change of an alarm.
     this.feeder = null;
     this.source = null;
     this.retry = null;
@@ -157,6 +158,7 @@ export class Alarms {
 
   take(event) {
     const { alarm } = event;
+    this.onChange();
     if (this.loading > 0) this.heard.set(alarm.id, event);
     this.put(alarm);
     this.render();
@@ -252,6 +254,7 @@ export class Alarms {
       const body = await response.json();
       if (!response.ok) throw new Error(body.detail);
       this.put(body);
+      this.onChange();
       this.render();
       byId("ack").close();
     } catch (error) {

@@ -1,6 +1,7 @@
 // Assembly of the page: selection of the feeder, its live states, and the freshness of the data.
 
 import { Alarms } from "./alarms.js";
+import { Incidents } from "./incidents.js";
 import { Commissioning } from "./commissioning.js";
 import { showDetail } from "./detail.js";
 import { Diagram } from "./diagram.js";
@@ -19,15 +20,18 @@ const SIGNS = {
 
 const page = { feeder: null, report: null, refused: null, selected: null, source: null, retry: null, heard: null, word: "…", others: 0, linked: true, alarmsLinked: true, past: new Map(), turn: 0 };
 const diagram = new Diagram({ onSelect: (id) => select(id === page.selected ? null : id) });
+const pick = async (feeder, meter, owner) => {
+  if (feeder !== page.feeder?.name) await show(feeder);
+  if (feeder !== page.feeder?.name) return;
+  const customer = page.feeder?.layout.customers.find((c) => (owner ? c.customer === owner : c.meter === meter));
+  if (customer) select(customer.customer);
+};
 const alarms = new Alarms({
-  onPick: async (feeder, meter, owner) => {
-    if (feeder !== page.feeder?.name) await show(feeder);
-    if (feeder !== page.feeder?.name) return;
-    const customer = page.feeder?.layout.customers.find((c) => (owner ? c.customer === owner : c.meter === meter));
-    if (customer) select(customer.customer);
-  },
+  onPick: pick,
   onLink: (up) => { page.alarmsLinked = up; },
+  onChange: () => incidents.later(),
 });
+const incidents = new Incidents({ alarms, onPick: pick });
 
 const fleet = new Fleet({ onPick: (name) => show(name), onChange: (attacked) => { page.others = attacked; title(); } });
 const commissioning = new Commissioning({ onChange: () => detail() });
@@ -85,6 +89,7 @@ async function show(name) {
   diagram.show(page.feeder);
   verdict();
   alarms.watch(name);
+  incidents.watch(name);
   commissioning.watch(name);
   listen(name);
 }
@@ -100,6 +105,7 @@ function refused(name, why) {
   verdict();
   fresh();
   alarms.watch(name);
+  incidents.watch(name);
   commissioning.watch(null);
 }
 
