@@ -12,6 +12,7 @@ const KIND = {
   undecided: "Undecided",
   "learning-stalled": "Learning stalled",
   "clock-offset": "Clock offset",
+  "identity-mismatch": "Identity mismatch",
 };
 const LISTED = 5; // Largest number of meters in the text of an alarm.
 const PAGE = 50;

@@ -10,6 +10,7 @@ const KIND = {
   "voltage-limit": "Voltage limit",
   undecided: "Undecided",
   "clock-offset": "Clock offset",
+  "identity-mismatch": "Identity mismatch",
   "learning-stalled": "Learning stalled",
 };
 const CHANGE = {
