@@ -12,7 +12,7 @@ INSTALL := $(BIN)/python -m pip install --no-deps --no-compile --quiet --disable
 COMPILE := uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate --no-header \
   --no-emit-index-url --no-emit-find-links
 
-.PHONY: demo test acceptance check lint types imports bench lock clean
+.PHONY: demo test acceptance check lint types imports bench sbom lock clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/gridsec demo
@@ -49,6 +49,11 @@ $(VENV)/.installed-demo: requirements.lock pyproject.toml
 	$(INSTALL) --require-hashes -r requirements.lock
 	$(INSTALL) --no-build-isolation --editable .
 	touch $@
+
+# Bill of materials of the run time, CycloneDX 1.6.
+sbom: $(VENV)/.installed-demo
+	mkdir -p dist
+	$(BIN)/python deploy/sbom.py requirements.lock > dist/gridsec.cdx.json
 
 # pytest treats warnings as errors, also those of a foreign module's syntax on its first import: all are compiled here.
 $(VENV)/.installed: $(VENV)/.installed-demo requirements-dev.lock

@@ -17,7 +17,7 @@ import structlog
 from feeders.format.tables import from_json
 from feeders.model.site import Site, from_tables, load
 from feeders.registry import choose
-from gridsec.errors import FeederInvalid, GridsecError, Problem
+from gridsec.errors import FeederInvalid, GridsecError, InputInvalid, Problem
 from service import systemd
 from service.access.tokens import TokenVerifier
 from service.api.access import Authenticator
@@ -29,9 +29,13 @@ from service.errors import prefixed
 from service.ingest.align import Clock
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import Bus
-from service.settings import Settings, SettingsInvalid, is_loopback, split_address
+from service.notify.delivery import Notifier
+from service.notify.notices import IncidentSource
+from service.notify.targets import Targets, read_targets
+from service.settings import ENV_PREFIX, Settings, SettingsInvalid, is_loopback, split_address
 from service.store import Store
 from service.store.access import AccessStore
+from service.store.deliveries import DeliveryStore
 
 _GRACE_S = 1
 _log = structlog.get_logger("gridsec.app")
@@ -69,6 +73,7 @@ async def serve(
     """
     shares = Shares.of(raise_limit())
     meter_keys = settings.read_meter_keys()
+    targets = _targets(settings)
     sites = {
         name: choose(site, estimator=settings.estimator)
         for name, site in load_sites(settings.feeders).items()
@@ -91,6 +96,7 @@ async def serve(
             max_payload=settings.max_payload,
             max_samples=settings.queue,
             max_feeders=settings.max_feeders,
+            shelve_most_s=3600.0 * settings.max_shelve_h,
             meter_keys=meter_keys,
         )
         runtime = Runtime(
@@ -115,11 +121,13 @@ async def serve(
             )
         )
         runtime.attach(bus)
+        notifier = _notifier(stack, settings, targets, store, runtime, wall=wall)
         api = create_api(
             runtime,
             settings.http_hosts,
             max_streams=min(MAX_STREAMS, shares.streams),
             authenticator=authenticator,
+            notifier=notifier,
         )
         server = _Server(
             api,
@@ -130,9 +138,10 @@ async def serve(
             timeout_graceful_shutdown=_GRACE_S,
             server_header=False,
         )
-        await _run(
-            runtime, server, listener, tuple(sites), announce=announce, signals=signals, stopping=stopping
-        )
+        with _waking(notifier, runtime):
+            await _run(
+                runtime, server, listener, tuple(sites), announce=announce, signals=signals, stopping=stopping
+            )
 
 
 def _tokens(settings: Settings) -> TokenVerifier | None:
@@ -142,6 +151,54 @@ def _tokens(settings: Settings) -> TokenVerifier | None:
     return TokenVerifier(
         settings.oidc_issuer, settings.oidc_audience, settings.oidc_jwks, settings.oidc_role_claim
     )
+
+
+def _targets(settings: Settings) -> Targets | None:
+    """Targets of notifications; None without a file. Raises SettingsInvalid if the file is wrong."""
+    if settings.notify is None:
+        return None
+    try:
+        return read_targets(settings.notify)
+    except InputInvalid as error:
+        start = f"--notify or {ENV_PREFIX}NOTIFY: "
+        raise SettingsInvalid(prefixed(start, one) for one in error.problems) from error
+
+
+def _notifier(
+    stack: ExitStack,
+    settings: Settings,
+    targets: Targets | None,
+    store: Store,
+    runtime: Runtime,
+    *,
+    wall: Callable[[], float],
+) -> Notifier | None:
+    """Notifier of the targets, ended with the stack; None without targets."""
+    if targets is None:
+        return None
+    deliveries = stack.enter_context(DeliveryStore(settings.database))
+    notifier = Notifier(targets, IncidentSource(store), deliveries, runtime.counters, wall)
+    stack.callback(notifier.close)
+    return notifier
+
+
+@contextlib.contextmanager
+def _waking(notifier: Notifier | None, runtime: Runtime) -> Iterator[None]:
+    """Start the notifier, and wake it after stored events, until the block ends."""
+    if notifier is None:
+        yield
+        return
+
+    async def wake() -> None:
+        async for _ in runtime.subscribe():
+            notifier.wake()
+
+    notifier.start()
+    task = asyncio.create_task(wake(), name="notify")
+    try:
+        yield
+    finally:
+        task.cancel()
 
 
 def _check_exposure(settings: Settings, authenticator: Authenticator) -> None:

@@ -25,6 +25,7 @@ class Metrics:
         self._of_readings(self._registry)
         self._of_ticks(self._registry)
         self._of_storing(self._registry)
+        self._of_notification(self._registry)
 
     def _of_readings(self, registry: CollectorRegistry) -> None:
         """Metrics of the input."""
@@ -92,6 +93,25 @@ class Metrics:
             "gridsec_log_lines_lost", "Lines of the log that could not be written.", registry=registry
         )
         unwritten.set_function(lambda: LineLogger.lost)
+
+    def _of_notification(self, registry: CollectorRegistry) -> None:
+        """Metrics of webhooks and of Alertmanager."""
+        gauge = partial(Gauge, registry=registry)
+        self.notified = Counter(
+            "gridsec_notifications",
+            "Messages by outcome: delivered, failed (an attempt), dead (given up), resent.",
+            ["target", "outcome"],
+            registry=registry,
+        )
+        self.notices_waiting = gauge(
+            "gridsec_notifications_waiting", "Events that a target has not received yet.", ["target"]
+        )
+        self.dead_letters = gauge("gridsec_dead_letters", "Messages that were given up.", ["target"])
+        self.notify_failing = gauge(
+            "gridsec_notification_failing_seconds",
+            "Time since the first failed request after the last success.",
+            ["target"],
+        )
 
     def count_bus(self, counts: BusCounts) -> None:
         """Update from the counters of the zenoh bus."""

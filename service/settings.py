@@ -82,6 +82,7 @@ class Settings(BaseSettings):
     max_payload: int = Field(default=256 * 1024, ge=1024, le=16 << 20)
     queue: int = Field(default=20_000, ge=100)
     max_feeders: int = Field(default=100, ge=0)
+    max_shelve_h: float = Field(default=24.0, gt=0.0, le=8760.0, allow_inf_nan=False)
     oidc_issuer: str = ""
     oidc_audience: str = "gridsec"
     oidc_jwks: str = ""
@@ -90,6 +91,7 @@ class Settings(BaseSettings):
     meter_keys: Path | None = None
     unsigned: Literal["refuse", "accept"] = "refuse"
     plaintext_network: bool = False
+    notify: Path | None = None
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     log_format: Literal["console", "json"] = "console"
 
@@ -149,7 +151,7 @@ class Settings(BaseSettings):
             raise InputInvalid([Problem("unknown-name", text)])
         return value
 
-    @field_validator("zenoh_config")
+    @field_validator("zenoh_config", "notify")
     @classmethod
     def _file(cls, value: Path | None) -> Path | None:
         if value is not None and not value.is_file():
@@ -258,7 +260,9 @@ def refuse_exposed(endpoints: Iterable[str]) -> None:
 def _problem(error: Any) -> Problem:
     name = str(error["loc"][0]) if error["loc"] else "settings"
     option, variable = "--" + name.replace("_", "-").removesuffix("-s"), ENV_PREFIX + name.upper()
-    option = {"--feeders": "--feeder", "--http-hosts": "--http-host"}.get(option, option)
+    option = {"--max-shelve-h": "--max-shelve", "--feeders": "--feeder", "--http-hosts": "--http-host"}.get(
+        option, option
+    )
     message = str(error["msg"]).removeprefix("Value error, ")
     kind = error["type"]
     if kind == "value_error":

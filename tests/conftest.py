@@ -26,7 +26,7 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("repeatable")
 
-SYSTEM_PARTS = {"browser", "postgresql"}
+SYSTEM_PARTS = {"alertmanager", "browser", "postgresql"}
 
 TESTS = Path(__file__).parent
 MEASURED = (

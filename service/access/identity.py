@@ -52,15 +52,48 @@ POLICY: Final[dict[str, Role | None]] = {
     "GET /api/v1/alarms/{alarm_id}": Role.VIEWER,
     "GET /api/v1/alarms/{alarm_id}/events": Role.VIEWER,
     "GET /api/v1/bad-readings": Role.VIEWER,
+    "GET /api/v1/incidents": Role.VIEWER,
+    "GET /api/v1/incidents/events": Role.VIEWER,
+    "GET /api/v1/incidents/stream": Role.VIEWER,
+    "GET /api/v1/incidents/{incident_id}": Role.VIEWER,
+    "GET /api/v1/incidents/{incident_id}/events": Role.VIEWER,
+    "GET /api/v1/shelves": Role.VIEWER,
+    "GET /api/v1/planned-work": Role.VIEWER,
+    "GET /api/v1/hand-over": Role.VIEWER,
+    "POST /api/v1/alarms/ack": Role.OPERATOR,
     "POST /api/v1/alarms/{alarm_id}/ack": Role.OPERATOR,
+    "POST /api/v1/alarms/{alarm_id}/unack": Role.OPERATOR,
+    "POST /api/v1/alarms/{alarm_id}/comment": Role.OPERATOR,
+    "POST /api/v1/incidents/{incident_id}/ack": Role.OPERATOR,
+    "POST /api/v1/incidents/{incident_id}/unack": Role.OPERATOR,
+    "POST /api/v1/incidents/{incident_id}/comment": Role.OPERATOR,
+    "POST /api/v1/incidents/{incident_id}/assign": Role.OPERATOR,
+    "POST /api/v1/shelves": Role.OPERATOR,
+    "POST /api/v1/shelves/{shelf_id}/end": Role.OPERATOR,
+    "POST /api/v1/planned-work": Role.OPERATOR,
+    "POST /api/v1/planned-work/{work_id}/end": Role.OPERATOR,
     "PUT /api/v1/feeders/{feeder}": Role.ENGINEER,
     "DELETE /api/v1/feeders/{feeder}": Role.ENGINEER,
     "POST /api/v1/feeders/{feeder}/commissioning": Role.ENGINEER,
+    "GET /api/v1/notifications": Role.OPERATOR,
+    "GET /api/v1/notifications/dead-letters": Role.OPERATOR,
+    "POST /api/v1/notifications/dead-letters/resend": Role.ENGINEER,
+    "POST /api/v1/notifications/dead-letters/discard": Role.ENGINEER,
     "GET /api/v1/audit": Role.ADMIN,
 }
 """Least role by method and path. The files of the web page hold no data and are public."""
 
-WHOLE_FLEET: Final = frozenset({"GET /metrics", "GET /api/v1/bad-readings", "GET /api/v1/audit"})
+WHOLE_FLEET: Final = frozenset(
+    {
+        "GET /metrics",
+        "GET /api/v1/bad-readings",
+        "GET /api/v1/notifications",
+        "GET /api/v1/notifications/dead-letters",
+        "POST /api/v1/notifications/dead-letters/resend",
+        "POST /api/v1/notifications/dead-letters/discard",
+        "GET /api/v1/audit",
+    }
+)
 """Routes with data of all feeders; identities with restricted feeders have no access."""
 
 

@@ -1,7 +1,8 @@
 """zenoh configurations with mutual TLS, and access rules by the common name of a certificate.
 
 The router refuses by default. One rule per certificate lets it publish the keys of its own meters. The
-service alone publishes estimates and alarms. Every certificate may subscribe to these and query them.
+service alone publishes estimates, alarms and incidents. Every certificate may subscribe to these and query
+them.
 """
 
 from __future__ import annotations
@@ -235,8 +236,9 @@ def access_control(plan: Plan, owners: Mapping[tuple[str, str], str]) -> dict[st
 def _shared_rules(plan: Plan) -> list[dict[str, Any]]:
     # The service also receives what is published on a wrong key: it keeps it as a bad reading.
     prefix, everything = plan.prefix, f"{plan.prefix}/**"
-    results = [f"{prefix}/*/estimate", f"{prefix}/*/alarm/*"]
-    own = [f"{prefix}/{feeder}/{what}" for feeder in sorted(plan.feeders) for what in ("estimate", "alarm/*")]
+    kinds = ("estimate", "alarm/*", "incident/*")
+    results = [f"{prefix}/*/{kind}" for kind in kinds]
+    own = [f"{prefix}/{feeder}/{kind}" for feeder in sorted(plan.feeders) for kind in kinds]
     alive = [f"{prefix}/service/*"]
     asks = ["declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query"]
     tells = ["put", "delete", "reply", "declare_queryable", "liveliness_token"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Annotated
@@ -32,6 +32,7 @@ class AlarmKind(StrEnum):
     UNDECIDED = "undecided"
     LEARNING_STALLED = "learning-stalled"
     CLOCK_OFFSET = "clock-offset"
+    IDENTITY_MISMATCH = "identity-mismatch"
 
 
 class Severity(StrEnum):
@@ -67,6 +68,7 @@ class AlarmEvidence:
     ] = None
     explanations: tuple[ExplanationReport, ...] = ()
     learning: Annotated[tuple[StalledMeter, ...], Field(description="Meters with stalled learning.")] = ()
+    silent: Annotated[tuple[str, ...], Field(description="Silent meters of an outage of the feeder.")] = ()
     data_error: Annotated[
         DataErrorReport | None,
         Field(description="Error of the feeder's files that explains the accusation as well."),
@@ -98,8 +100,16 @@ class Condition:
         return self.customer or self.meter
 
 
-def conditions(report: FeederReport) -> list[Condition]:
+MOST_SILENT = 0.5
+"""Share of a feeder's meters beyond which their silence is one condition of the feeder."""
+FEW_METERS = 3
+"""Number of silent meters below which each one has its own condition."""
+
+
+def conditions(report: FeederReport, *, connecting: bool = False) -> list[Condition]:
     """Return the present and the unknown conditions of a feeder at one tick.
+
+    connecting: a meter has had no reading since the start and is not silent yet.
 
     - `meter-manipulated`: the verdict names the meter, or the busbar meter. Unknown while the verdict is
       UNDECIDED or the meter is unavailable, whatever the list of suspects; for the busbar meter also with an
@@ -110,9 +120,10 @@ def conditions(report: FeederReport) -> list[Condition]:
       manipulated meter raises none. Unknown while the interval contains a limit with its middle outside, or
       while the reconstruction has no guarantee or is model only.
     - `data-loss`: a meter, or the busbar meter, is silent. Unknown while it is unavailable but not yet
-      silent.
-    - `undecided`: there is no verdict, for a separate cause. Unknown while the monitor settles, or if
-      `data-loss` gives the reason: every meter without a reading is silent.
+      silent. If most meters are silent, there is one condition of the feeder, and those of meters are
+      unknown.
+    - `undecided`: there is no verdict, for a separate cause. Unknown while the monitor settles, while meters
+      connect, or if `data-loss` gives the reason: every meter without a reading is silent.
     - `learning-stalled`: the fixed error of a meter is not learned after twice the expected time; one
       condition per feeder. Unknown at a tick without a monitor.
     - `clock-offset`: the clock of a meter, or of the busbar meter, is measurably ahead or behind, or its
@@ -121,7 +132,8 @@ def conditions(report: FeederReport) -> list[Condition]:
     A condition that is not in the list is absent.
     """
     manipulated = (*_manipulated(report), *_busbar(report), *_inverters(report))
-    found = [*manipulated, *_data_loss(report), *_undecided(report), *_learning(report), *_clocks(report)]
+    undecided = _undecided(report, connecting=connecting)
+    found = [*manipulated, *_data_loss(report), *undecided, *_learning(report), *_clocks(report)]
     for meter in report.meters:
         found.extend(_voltage_limit(report, meter))
     return found
@@ -259,6 +271,9 @@ def _voltage_limit(report: FeederReport, meter: MeterState) -> Iterable[Conditio
 
 def _data_loss(report: FeederReport) -> Iterable[Condition]:
     silent = {one.meter: one.seconds for one in report.silent}
+    most = _most_silent(report)
+    if most:
+        yield _outage(report, most)
     unsure = [meter.meter for meter in report.meters if not meter.seen and meter.meter not in silent]
     busbar_seen = report.busbar.seen and report.cause is not Cause.NO_BUSBAR
     if not busbar_seen and BUSBAR not in silent:
@@ -266,15 +281,46 @@ def _data_loss(report: FeederReport) -> Iterable[Condition]:
     for meter, seconds in silent.items():
         # Without the busbar voltage the whole feeder is not monitored.
         severity = Severity.MAJOR if meter == BUSBAR else Severity.MINOR
-        length = "yet" if seconds is None else f"for {seconds:.0f} s"
         yield Condition(
-            AlarmKind.DATA_LOSS, report.feeder, meter, severity, reason=f"no usable reading {length}"
+            AlarmKind.DATA_LOSS,
+            report.feeder,
+            meter,
+            severity,
+            reason=f"no usable reading {_length(seconds)}",
+            known=not most,
         )
     for meter in unsure:
         yield Condition(AlarmKind.DATA_LOSS, report.feeder, meter, Severity.MINOR, known=False)
 
 
-def _undecided(report: FeederReport) -> Iterable[Condition]:
+def _length(seconds: float | None) -> str:
+    return "yet" if seconds is None else f"for {seconds:.0f} s"
+
+
+def _most_silent(report: FeederReport) -> tuple[str, ...]:
+    """The silent meters of customers, if these are most of them."""
+    silent = tuple(one.meter for one in report.silent if one.meter != BUSBAR)
+    most = len(silent) >= FEW_METERS and len(silent) > MOST_SILENT * len(report.meters)
+    return silent if most else ()
+
+
+def _outage(report: FeederReport, silent: tuple[str, ...]) -> Condition:
+    """Silence of most meters: one condition of the feeder."""
+    busbar = any(one.meter == BUSBAR for one in report.silent)
+    known = [one.seconds for one in report.silent if one.seconds is not None]
+    also = ", and neither has the substation's" if busbar else ""
+    return Condition(
+        AlarmKind.DATA_LOSS,
+        report.feeder,
+        None,
+        Severity.MAJOR,
+        AlarmEvidence(silent=(*silent, *((BUSBAR,) if busbar else ()))),
+        f"{len(silent)} of {len(report.meters)} meters have no usable reading "
+        f"{_length(min(known, default=None))}{also}",
+    )
+
+
+def _undecided(report: FeederReport, *, connecting: bool) -> Iterable[Condition]:
     if report.verdict is not Decision.UNDECIDED:
         return
     unheard = report.cause in {Cause.SILENT_METERS, Cause.NO_BUSBAR}
@@ -283,6 +329,7 @@ def _undecided(report: FeederReport) -> Iterable[Condition]:
         gone = [BUSBAR]
     # A meter that is unavailable at every other tick is never silent; only this condition reports it.
     told = bool(gone) and {*gone} <= {one.meter for one in report.silent}
+    told = told or (report.cause is Cause.TOO_FEW_METERS and bool(_most_silent(report)))
     # Each of these meters has an alarm of kind `clock-offset`.
     told = told or report.cause is Cause.CLOCK_OFFSET
     yield Condition(
@@ -292,9 +339,25 @@ def _undecided(report: FeederReport) -> Iterable[Condition]:
         Severity.MAJOR,
         AlarmEvidence(explanations=report.explanations, data_error=report.data_error),
         reason=report.reason,
-        known=not told and report.cause is not Cause.SETTLING,
+        known=not told
+        and (not connecting or report.cause is Cause.DESIGN_INVALID)
+        and report.cause is not Cause.SETTLING,
         unheard=unheard,
     )
+
+
+def identity_mismatches(feeder: str, refused: Mapping[str, str]) -> list[Condition]:
+    """Return the conditions of meters with readings of another identity.
+
+    refused: the latest problem by meter, of readings that were refused for their signature or their sender.
+    """
+    kind, severity = AlarmKind.IDENTITY_MISMATCH, Severity.MAJOR
+    return [
+        Condition(
+            kind, feeder, meter, severity, reason=f"readings of another identity are refused: {problem}"
+        )
+        for meter, problem in sorted(refused.items())
+    ]
 
 
 def _clocks(report: FeederReport) -> Iterable[Condition]:

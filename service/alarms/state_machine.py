@@ -29,6 +29,9 @@ from pydantic import Field, TypeAdapter
 from gridsec.errors import GridsecError, InputInvalid, Problem
 from service.alarms.conditions import AlarmEvidence, AlarmKind, Condition, Severity, conditions
 
+INCIDENT_S = 60.0
+"""Largest distance in time of alarms of one incident, s; two ticks if these are longer."""
+
 
 class AlarmState(StrEnum):
     """State of an alarm. Clearing keeps the acknowledgement; raising again requires a new one."""
@@ -45,6 +48,8 @@ class Change(StrEnum):
     ACKNOWLEDGED = "acknowledged"
     CLEARED = "cleared"
     UPDATED = "updated"
+    UNACKNOWLEDGED = "unacknowledged"
+    COMMENTED = "commented"
 
 
 class AlarmUnknown(GridsecError):
@@ -65,6 +70,16 @@ class AlreadyAcknowledged(GridsecError):
     def __init__(self, alarm: Alarm) -> None:
         self.alarm = alarm
         super().__init__(f"alarm {alarm.id} has already been acknowledged by {alarm.acknowledged_by}")
+
+
+class NotAcknowledged(GridsecError):
+    """The alarm is not acknowledged."""
+
+    code = "not-acknowledged"
+
+    def __init__(self, alarm: Alarm) -> None:
+        self.alarm = alarm
+        super().__init__(f"alarm {alarm.id} is not acknowledged")
 
 
 class RaisedAgain(GridsecError):
@@ -126,6 +141,8 @@ class AlarmTransition:
     t: float
     who: str | None = None
     comment: str | None = None
+    # Largest distance in time of alarms of the feeder with one cause, s.
+    window_s: float = INCIDENT_S
 
 
 _ALARM = TypeAdapter(Alarm)
@@ -157,6 +174,7 @@ __all__ = [
     "AlreadyAcknowledged",
     "Change",
     "Condition",
+    "NotAcknowledged",
     "RaisedAgain",
     "Severity",
     "acknowledged",
@@ -164,12 +182,14 @@ __all__ = [
     "carried",
     "carry",
     "close",
+    "commented",
     "conditions",
     "first_id",
     "from_json",
     "hold",
     "restore",
     "to_json",
+    "unacknowledged",
 ]
 
 
@@ -188,6 +208,8 @@ class AlarmRules:
     memory_s: float = 600.0
     # A condition caused only by missing readings must be present for longer than this to raise an alarm, s.
     silence_s: float = 0.0
+    # Largest distance in time of alarms of the feeder with one cause, s.
+    incident_s: float = INCIDENT_S
 
     def __post_init__(self) -> None:
         times = (
@@ -195,6 +217,7 @@ class AlarmRules:
             self.off_delay_s,
             self.memory_s,
             self.silence_s,
+            self.incident_s,
             *self.on_delays_s.values(),
             *self.off_delays_s.values(),
         )
@@ -339,7 +362,7 @@ def _present(
         alarm, change = replace(alarm, reason=condition.reason, evidence=condition.evidence), Change.UPDATED
     else:
         return entry, ()
-    return replace(entry, alarm=alarm), (AlarmTransition(alarm, change, t),)
+    return replace(entry, alarm=alarm), (AlarmTransition(alarm, change, t, window_s=rules.incident_s),)
 
 
 def _explains_more(now: AlarmEvidence, before: AlarmEvidence) -> bool:
@@ -391,9 +414,7 @@ def alarm_id(condition: Condition, onset: float) -> str:
     In the form of a ULID: ten characters of Crockford's base 32 for the milliseconds, then sixteen, which are
     a hash instead of random bits, so that a replay gives the same ids.
     """
-    what = "\0".join((condition.kind, condition.feeder, condition.subject or "", repr(onset)))
-    tail = int.from_bytes(hashlib.sha256(what.encode()).digest()[:10], "big")
-    return _text_of(onset, tail)
+    return ulid(onset, condition.kind, condition.feeder, condition.subject or "", repr(onset))
 
 
 def first_id(t: float) -> str:
@@ -401,8 +422,13 @@ def first_id(t: float) -> str:
     return _text_of(t, 0)
 
 
-def _text_of(onset: float, tail: int) -> str:
-    number = (max(0, int(onset * 1000.0)) % (1 << 48)) << 80 | tail
+def ulid(t: float, *parts: str) -> str:
+    """Return an id in the form of a ULID, with a hash of the parts instead of random bits."""
+    return _text_of(t, int.from_bytes(hashlib.sha256("\0".join(parts).encode()).digest()[:10], "big"))
+
+
+def _text_of(t: float, tail: int) -> str:
+    number = (max(0, int(t * 1000.0)) % (1 << 48)) << 80 | tail
     return "".join(_CROCKFORD[number >> shift & 31] for shift in range(125, -1, -5))
 
 
@@ -431,16 +457,39 @@ def acknowledged(
     return AlarmTransition(answered, Change.ACKNOWLEDGED, t, who, comment)
 
 
+def unacknowledged(alarm: Alarm, who: str, comment: str, t: float) -> AlarmTransition:
+    """Return the transition by which an operator withdraws the acknowledgement of an alarm.
+
+    Raises NotAcknowledged if there is none.
+    """
+    if alarm.acknowledged_by is None:
+        raise NotAcknowledged(alarm)
+    open_again = replace(
+        alarm,
+        state=AlarmState.RAISED if alarm.active else alarm.state,
+        acknowledged_by=None,
+        t_acknowledged=None,
+        comment=None,
+    )
+    return AlarmTransition(open_again, Change.UNACKNOWLEDGED, t, who, comment)
+
+
+def commented(alarm: Alarm, who: str, comment: str, t: float) -> AlarmTransition:
+    """Return the transition by which an operator adds a comment; the alarm stays as it is."""
+    return AlarmTransition(alarm, Change.COMMENTED, t, who, comment)
+
+
 def carried(alarm: Alarm, answered: Alarm) -> Alarm:
-    """Return an alarm with the acknowledgement that was stored while it changed.
+    """Return an alarm with the acknowledgement, or its withdrawal, that was stored while it changed.
 
     `answered` is ignored for another alarm or occurrence.
     """
     if (alarm.id, alarm.count) != (answered.id, answered.count):
         return alarm
+    now = AlarmState.RAISED if answered.acknowledged_by is None else AlarmState.ACKNOWLEDGED
     return replace(
         alarm,
-        state=AlarmState.ACKNOWLEDGED if alarm.active else alarm.state,
+        state=now if alarm.active else alarm.state,
         acknowledged_by=answered.acknowledged_by,
         t_acknowledged=answered.t_acknowledged,
         comment=answered.comment,

@@ -26,7 +26,12 @@ BODY = "FeederTables"
 TAGS = [
     {"name": "feeders", "description": "Feeders: verdicts, history, commissioning, and changes of the set."},
     {"name": "alarms", "description": "Alarms, their events, and acknowledgement."},
+    {
+        "name": "incidents",
+        "description": "Incidents of alarms, shelves, planned work, hand-over of the shift.",
+    },
     {"name": "streams", "description": "Server-sent events."},
+    {"name": "notifications", "description": "Targets of notifications, and messages that were given up."},
     {"name": "access", "description": "Identity of the caller, sessions of the web page, audit log."},
     {"name": "operations", "description": "Probes, metrics and rejected readings."},
 ]

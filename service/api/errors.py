@@ -18,7 +18,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from feeders.registry import EstimatorUnusable
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
 from service.access.identity import IssuerUnavailable, NotAuthenticated, NotPermitted, TooManyFailures
-from service.alarms.state_machine import AlarmUnknown, AlreadyAcknowledged, RaisedAgain
+from service.alarms.incidents import IncidentChanged, IncidentUnknown, ShelfUnknown, WorkUnknown, WrongTime
+from service.alarms.state_machine import AlarmUnknown, AlreadyAcknowledged, NotAcknowledged, RaisedAgain
 from service.engine.commissioning import NothingToLearn
 from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, TooManyFeeders
 from service.store import OutcomeUnknown, StoreUnavailable
@@ -190,9 +191,15 @@ _STATUS: dict[type[GridsecError], int] = {
     DesignInfeasible: 422,
     EstimatorUnusable: 422,
     AlarmUnknown: 404,
+    IncidentUnknown: 404,
+    ShelfUnknown: 404,
+    WorkUnknown: 404,
+    WrongTime: 422,
     FeederUnknown: 404,
     AlreadyAcknowledged: 409,
     RaisedAgain: 409,
+    NotAcknowledged: 409,
+    IncidentChanged: 409,
     FeederFixed: 409,
     NothingToLearn: 409,
     TooManyFeeders: 409,

@@ -11,15 +11,28 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    JsonValue,
+    StringConstraints,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
 
 from gridsec.interface import Cause, Decision
 from service.access.audit import AuditEntry
 from service.access.identity import Role
-from service.alarms.state_machine import Alarm, AlarmKind, Severity
+from service.alarms.conditions import AlarmKind, Severity
+from service.alarms.incidents import Incident, IncidentEvent, PlannedWork, Shelf
+from service.alarms.state_machine import Alarm
 from service.engine.commissioning import CommissioningProgress, MeterCommissioning
+from service.notify.delivery import TargetStatus
 from service.report.report import FeederReport, MeterState, ModelOnly
 from service.store import AlarmEvent
+from service.store.incidents import Said
 from service.store.schema import CommissioningEvent
 
 RENAMED = {
@@ -35,6 +48,8 @@ Line = Annotated[
         strip_whitespace=True, min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]*$"
     ),
 ]
+Id = Annotated[str, StringConstraints(pattern=r"^[0-9A-Z]{26}$")]
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 Text = Annotated[
     str,
     StringConstraints(strip_whitespace=True, max_length=1000, pattern=r"^[^\x00-\x08\x0b-\x1f\x7f-\x9f]*$"),
@@ -80,7 +95,7 @@ class Commissioning(CommissioningProgress):
     kept: Annotated[float | None, Field(description="Newest tick of the stored commissioning, Unix s.")]
 
 
-Shown = TypeVar("Shown", State, MeterNow, Commissioning)
+Shown = TypeVar("Shown", State, MeterNow, Commissioning, "ListedAlarm")
 
 
 def extended(kind: type[Shown], base: Any, **more: Any) -> Shown:
@@ -171,10 +186,25 @@ class FeederDetail(BaseModel):
     tables: dict[str, Any]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ListedAlarm(Alarm):
+    """An alarm, with its incident and what suppresses its notification."""
+
+    incident: Annotated[
+        str | None, Field(description="Id of its incident; null if it cleared before incidents existed.")
+    ] = None
+    shelved_until: Annotated[
+        float | None, Field(description="End of its shelf; null if not shelved or cleared.")
+    ] = None
+    planned_work: Annotated[
+        str | None, Field(description="Id of the planned work during which it was raised.")
+    ] = None
+
+
 class Alarms(BaseModel):
     """A page of alarms, those with the latest onset first."""
 
-    alarms: list[Alarm]
+    alarms: list[ListedAlarm]
     next: str | None = Field(description="Cursor of the next page; null on the last one.")
     last_event: int = Field(
         description="Newest event number: `after` of the stream that continues from here."
@@ -228,6 +258,53 @@ class AuditLog(BaseModel):
     entries: list[AuditEntry]
 
 
+class Targets(BaseModel):
+    """Targets of notifications."""
+
+    targets: list[TargetStatus]
+
+
+class Letter(BaseModel):
+    """Message that was given up."""
+
+    id: int = Field(description="Number of the dead letter.")
+    target: str
+    number: int = Field(description="Number of the event.")
+    message_id: str = Field(description="The same at every attempt.")
+    type: str
+    t: float
+    died: float = Field(description="Time at which it was given up.")
+    attempts: int
+    problem: str = Field(description="Problem of the last attempt.")
+    resend: bool = Field(description="Requested to be sent again.")
+    message: JsonValue = Field(description="The message.")
+
+
+class Letters(BaseModel):
+    """A page of dead letters, oldest first."""
+
+    dead_letters: list[Letter]
+    next: int | None = Field(description="`after` of the next page; null on the last one.")
+
+
+class LetterChoice(BaseModel):
+    """Choice of dead letters; without a field all of them."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    target: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]{1,64}$")] | None = None
+    ids: (
+        Annotated[list[Annotated[int, Field(ge=1, le=(1 << 63) - 1)]], Field(min_length=1, max_length=1000)]
+        | None
+    ) = None
+
+
+class LetterCount(BaseModel):
+    """Number of chosen dead letters."""
+
+    count: int
+
+
 class Acknowledgement(BaseModel):
     """Acknowledgement by an operator."""
 
@@ -240,6 +317,149 @@ class Acknowledgement(BaseModel):
         ge=1,
         description="The alarm's `count` that the operator refers to; 409 if it has been raised since.",
     )
+
+
+class BulkAcknowledgement(BaseModel):
+    """Acknowledgement of several alarms; those that are acknowledged already stay."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    who: Who = None
+    comment: Text = ""
+    alarms: Annotated[list[Id], Field(min_length=1, max_length=1000)]
+
+
+class IncidentAcknowledgement(BaseModel):
+    """Acknowledgement of all active alarms of an incident."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    who: Who = None
+    comment: Text = ""
+    count: int | None = Field(
+        default=None,
+        ge=1,
+        description="The incident's `count` that the operator refers to; 409 if alarms were raised since.",
+    )
+
+
+class Withdrawal(BaseModel):
+    """Withdrawal of an acknowledgement, or early end of a shelf or of planned work."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    who: Who = None
+    comment: Text = ""
+
+
+class Remark(BaseModel):
+    """Comment of an operator."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    who: Who = None
+    comment: Annotated[Text, StringConstraints(min_length=1)]
+
+
+class Assignment(BaseModel):
+    """Assignment of an incident."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    who: Who = None
+    to: Line | None = Field(description="Name of the person; null withdraws the assignment.")
+    comment: Text = ""
+
+
+class Shelving(BaseModel):
+    """Request of a shelf: of an `alarm`, an `incident`, or a `feeder` with a `meter`, a `kind`, or both."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    who: Who = None
+    alarm: Id | None = None
+    incident: Id | None = None
+    feeder: Name | None = None
+    meter: Name | None = None
+    kind: AlarmKind | None = None
+    severity: Severity | None = Field(
+        default=None, description="An alarm of a higher one ends the shelf; by default that of the alarms."
+    )
+    duration_s: float = Field(gt=0.0, allow_inf_nan=False, description="Time until its end, s.")
+    reason: Annotated[Text, StringConstraints(min_length=1)]
+
+    @model_validator(mode="after")
+    def _one_target(self) -> Shelving:
+        part = self.feeder is not None and (self.meter is not None or self.kind is not None)
+        stray = self.feeder is None and (self.meter is not None or self.kind is not None)
+        targets = (self.alarm is not None) + (self.incident is not None) + (self.feeder is not None)
+        if targets != 1 or stray or (self.feeder is not None and not part):
+            text = "expected `alarm`, or `incident`, or `feeder` with `meter` or `kind`"
+            raise PydanticCustomError("target", text)
+        return self
+
+
+class Shelves(BaseModel):
+    """Shelves, newest first."""
+
+    shelves: list[Shelf]
+    max_duration_s: float = Field(description="Longest time of a shelf, s.")
+
+
+class WorkRequest(BaseModel):
+    """Planned work on a feeder."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    who: Who = None
+    feeder: Name
+    t_from: float | None = Field(
+        default=None, allow_inf_nan=False, description="Begin, Unix s; without it now."
+    )
+    t_until: float = Field(allow_inf_nan=False, description="End, Unix s; at most 31 days later.")
+    reason: Annotated[Text, StringConstraints(min_length=1)]
+
+
+class PlannedWorks(BaseModel):
+    """Planned works, newest first."""
+
+    planned_work: list[PlannedWork]
+
+
+class Incidents(BaseModel):
+    """A page of incidents."""
+
+    incidents: list[Incident]
+    next: str | None = Field(description="Cursor of the next page; null on the last one.")
+    last_event: int = Field(
+        description="Newest event number: `after` of the stream that continues from here."
+    )
+    raised: int = Field(
+        description="Number of incidents to act on, of all feeders: not acknowledged, not shelved, not under "
+        "planned work."
+    )
+    unstored: int = Field(
+        default=0, description="Number of alarm changes that wait for the database and are not included."
+    )
+    problem: str | None = Field(default=None, description="Problem of the database; null without one.")
+
+
+class IncidentEvents(BaseModel):
+    """A page of events of incidents, oldest first."""
+
+    events: list[IncidentEvent]
+    next: int | None = Field(description="`after` of the next page; null on the last one.")
+
+
+class HandOver(BaseModel):
+    """State of the shift: open incidents, shelves, planned work, and comments since a time."""
+
+    t: float = Field(description="Time of the response, Unix s.")
+    since: float
+    incidents: list[Incident] = Field(description="Open incidents, the most severe first.")
+    shelves: list[Shelf] = Field(description="Shelves that apply.")
+    planned_work: list[PlannedWork] = Field(description="Present and future planned work.")
+    comments: list[Said] = Field(description="Comments since then, oldest first.")
 
 
 class Recommissioning(BaseModel):

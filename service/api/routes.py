@@ -13,10 +13,12 @@ import hashlib
 import json
 import secrets
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Collection, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Collection, Iterable, Sequence
+from concurrent.futures import Future
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path as FilePath
-from typing import Annotated, Any, Protocol, cast
+from typing import Annotated, Any, Literal, Protocol, TypeVar, cast
 
 from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Depends, FastAPI, Header, HTTPException, Path, Query, Request, Response
@@ -29,17 +31,32 @@ from starlette.middleware.gzip import GZipMiddleware
 
 from gridsec.errors import FeederInvalid, GridsecError, Problem
 from service.access.identity import OPEN, POLICY, PUBLIC, Identity, NotPermitted, Role
+from service.alarms.incidents import (
+    Incident,
+    IncidentEvent,
+    IncidentKind,
+    IncidentState,
+    IncidentUnknown,
+    PlannedWork,
+    Shelf,
+    ShelfUnknown,
+    WorkUnknown,
+)
 from service.alarms.state_machine import Alarm, AlarmKind, AlarmState, AlarmUnknown, Severity
 from service.api import guide, models, tables
 from service.api.access import COOKIE, FRESH_S, Authenticator, authorise, client_of, session_of
 from service.api.description import BODY, TAGS, feeder_schemas
 from service.api.errors import Guard, HeadAsGet, handlers, problem
 from service.engine.commissioning import CommissioningProgress
+from service.engine.operators import Operators, ShelfRequest
 from service.errors import FeederNotLoaded, FeederUnknown
+from service.notify.delivery import Notifier
 from service.report.report import BUSBAR, FeederReport
 from service.settings import is_loopback
 from service.store import AlarmEvent, Store, StoreUnavailable
 from service.store.series import LONGEST_S
+
+T = TypeVar("T")
 
 
 class Backend(Protocol):
@@ -90,6 +107,13 @@ class Backend(Protocol):
 
     async def acknowledge(self, alarm_id: str, who: str, comment: str, *, count: int | None = None) -> Alarm:
         """Acknowledge an alarm and return it; raises AlarmUnknown, RaisedAgain or AlreadyAcknowledged."""
+
+    async def operate(self, action: Callable[[Operators], Future[T]]) -> T:
+        """Execute an action of an operator; it is stored when this returns. Raises its errors."""
+
+    @property
+    def shelve_most_s(self) -> float:
+        """Longest time of a shelf, s."""
 
     async def recommission(
         self, name: str, meters: Sequence[str], who: str, reason: str
@@ -171,6 +195,7 @@ GZIP_LEVEL = 5
 MAX_EVENT = (1 << 63) - 1
 """Largest number of an event."""
 _STATE, _EVENT = TypeAdapter(models.State), TypeAdapter(AlarmEvent)
+_INCIDENT_EVENT = TypeAdapter(IncidentEvent)
 _WEB = FilePath(__file__).parent.with_name("web")
 _NAME = r"^[A-Za-z0-9_-]{1,64}$"
 
@@ -181,6 +206,7 @@ def create_api(
     *,
     max_streams: int = MAX_STREAMS,
     authenticator: Authenticator | None = None,
+    notifier: Notifier | None = None,
 ) -> FastAPI:
     """Return the HTTP application.
 
@@ -199,7 +225,7 @@ def create_api(
         responses={"default": {"model": models.Problem, "description": "Any error."}},
         dependencies=[Depends(_authorised)],
     )
-    app.state.authenticator = authenticator
+    app.state.authenticator, app.state.notifier = authenticator, notifier
     app.state.access_threads = CapacityLimiter(ACCESS_THREADS)
     app.state.backend = backend
     app.state.probe = Probe(backend.store, authenticator)
@@ -213,6 +239,11 @@ def create_api(
     app.add_exception_handler(RequestValidationError, _validation_handler)
     app.include_router(_feeders)
     app.include_router(_alarms)
+    app.include_router(_incidents)
+    app.include_router(_shelves)
+    app.include_router(_works)
+    app.include_router(_shift)
+    app.include_router(_notifications)
     app.include_router(_operations)
     app.include_router(_sessions)
     app.add_route(guide.ADDRESS, guide.show, include_in_schema=False)
@@ -338,6 +369,13 @@ BackendHere = Annotated[Backend, Depends(_backend)]
 Caller = Annotated[Identity, Depends(_authorised)]
 FeederName = Annotated[str, Path(pattern=_NAME, description="Name of the feeder.")]
 AlarmId = Annotated[str, Path(pattern=r"^[0-9A-Z]{26}$", description="Id of the alarm.")]
+IncidentId = Annotated[str, Path(pattern=r"^[0-9A-Z]{26}$", description="Id of the incident.")]
+ShelfId = Annotated[str, Path(pattern=r"^[0-9A-Z]{26}$", description="Id of the shelf.")]
+WorkId = Annotated[str, Path(pattern=r"^[0-9A-Z]{26}$", description="Id of the planned work.")]
+Words = Annotated[
+    str | None, Query(max_length=200, description="Only with each of these words, in any case.")
+]
+Cursor = Annotated[str | None, Query(pattern=r"^([0-9.e+-]{1,32}~)?[0-9A-Z]{26}$")]
 Since = Annotated[float | None, Query(allow_inf_nan=False, description="Not before this Unix time, s.")]
 Until = Annotated[float | None, Query(allow_inf_nan=False, description="Before this Unix time, s.")]
 
@@ -699,13 +737,19 @@ def list_alarms(  # one argument per query parameter
     meter: Annotated[str | None, Query(pattern=_NAME)] = None,
     since: Since = None,
     until: Until = None,
-    cursor: Annotated[str | None, Query(pattern=r"^[0-9A-Z]{26}$")] = None,
+    text: Words = None,
+    incident: Annotated[str | None, Query(pattern=r"^[0-9A-Z]{26}$", description="Of this incident.")] = None,
+    shelved: Annotated[bool | None, Query(description="Only shelved ones, or only others.")] = None,
+    sort: Annotated[
+        Literal["onset", "severity", "raised"], Query(description="Latest, or most severe, first.")
+    ] = "onset",
+    cursor: Cursor = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
     if_none_match: IfNoneMatch = None,
 ) -> Any:
-    """A page of alarms, those with the latest onset first; `since` and `until` refer to `t_raised`."""
+    """A page of alarms; `since` and `until` refer to `t_raised`."""
     _within(caller, feeder)
-    last_event = backend.store.last_event
+    last_event, last_change = backend.store.last_event, backend.store.last_incident_event
     # Before the page is read: changes stored in between are in the page.
     unstored, trouble = backend.unstored()
     # Event numbers identify changes within one database, and a run has only one.
@@ -713,7 +757,7 @@ def list_alarms(  # one argument per query parameter
     waits = hashlib.sha256(f"{unstored} {trouble} {scope}".encode()).hexdigest()[:16]
     form = "" if media == tables.JSON else f"-{tables.MEDIA.index(media)}"
     if known := _unchanged(
-        response, f'W/"{request.app.state.run}-{last_event}-{waits}{form}"', if_none_match
+        response, f'W/"{request.app.state.run}-{last_event}-{last_change}-{waits}{form}"', if_none_match
     ):
         return known
     page, following = backend.store.alarms(
@@ -725,16 +769,21 @@ def list_alarms(  # one argument per query parameter
         meter=meter,
         since=since,
         until=until,
+        text=text,
+        incident=incident,
+        shelved=shelved,
+        sort=sort,
         cursor=cursor,
         limit=limit,
     )
+    listed = _listed(backend, page)
     if not page and (feeder is not None or meter is not None):
         _check_filters(backend, caller, feeder, meter)
     _link(request, response, media, **({} if following is None else {"cursor": following}))
     if media != tables.JSON:
-        return _as_table(response, tables.encoded(tables.alarms(page), media), media)
+        return _as_table(response, tables.encoded(tables.alarms(listed), media), media)
     return models.Alarms(
-        alarms=page,
+        alarms=listed,
         next=following,
         last_event=last_event,
         raised=backend.store.raised(among=scope),
@@ -782,9 +831,26 @@ async def stream_alarms(  # noqa: PLR0917  # one argument per query parameter
 
 
 @_alarms.get("/{alarm_id}")
-def get_alarm(backend: BackendHere, caller: Caller, alarm_id: AlarmId) -> Alarm:
+def get_alarm(backend: BackendHere, caller: Caller, alarm_id: AlarmId) -> models.ListedAlarm:
     """One alarm."""
-    return _alarm(backend, caller, alarm_id)
+    (listed,) = _listed(backend, [_alarm(backend, caller, alarm_id)])
+    return listed
+
+
+def _listed(backend: Backend, alarms: Iterable[Alarm]) -> list[models.ListedAlarm]:
+    """Alarms with their incidents and what suppresses their notifications."""
+    found = list(alarms)
+    marks = backend.store.alarm_marks(alarm.id for alarm in found)
+    return [
+        models.extended(
+            models.ListedAlarm,
+            alarm,
+            incident=marks[alarm.id].incident,
+            shelved_until=marks[alarm.id].shelved_until,
+            planned_work=marks[alarm.id].planned_work,
+        )
+        for alarm in found
+    ]
 
 
 def _alarm(backend: Backend, caller: Identity, alarm_id: str) -> Alarm:
@@ -816,6 +882,40 @@ def get_events(
     return models.AlarmEvents(events=page, next=page[-1].seq if len(found) > limit else None)
 
 
+@_alarms.post("/ack", dependencies=[Depends(_json_only)])
+async def acknowledge_alarms(
+    backend: BackendHere, caller: Caller, answer: models.BulkAcknowledgement
+) -> list[Alarm]:
+    """Acknowledge several alarms, all or none; those that are acknowledged already stay."""
+    who = _operator(caller, answer.who)
+    if caller.feeders is not None:
+        await to_thread.run_sync(lambda: [_alarm(backend, caller, each) for each in answer.alarms])
+    names = list(dict.fromkeys(answer.alarms))
+    return await backend.operate(lambda act: act.acknowledge(names, who, answer.comment))
+
+
+@_alarms.post("/{alarm_id}/unack", dependencies=[Depends(_json_only)])
+async def withdraw_acknowledgement(
+    backend: BackendHere, caller: Caller, alarm_id: AlarmId, answer: models.Withdrawal
+) -> Alarm:
+    """Withdraw the acknowledgement of an alarm."""
+    who = _operator(caller, answer.who)
+    await to_thread.run_sync(_alarm, backend, caller, alarm_id)
+    (alarm,) = await backend.operate(lambda act: act.unacknowledge(alarm_id, who, answer.comment))
+    return alarm
+
+
+@_alarms.post("/{alarm_id}/comment", dependencies=[Depends(_json_only)])
+async def comment_alarm(
+    backend: BackendHere, caller: Caller, alarm_id: AlarmId, answer: models.Remark
+) -> Alarm:
+    """Add a comment to an alarm; it is an event of the alarm."""
+    who = _operator(caller, answer.who)
+    await to_thread.run_sync(_alarm, backend, caller, alarm_id)
+    (alarm,) = await backend.operate(lambda act: act.comment(alarm_id, who, answer.comment))
+    return alarm
+
+
 @_alarms.post("/{alarm_id}/ack", dependencies=[Depends(_json_only)])
 async def acknowledge(
     backend: BackendHere, caller: Caller, alarm_id: AlarmId, answer: models.Acknowledgement
@@ -825,6 +925,329 @@ async def acknowledge(
     if caller.feeders is not None:
         await to_thread.run_sync(_alarm, backend, caller, alarm_id)
     return await backend.acknowledge(alarm_id, who, answer.comment, count=answer.count)
+
+
+# ------------------------------------------------------------------ incidents
+
+_incidents = APIRouter(prefix="/api/v1/incidents", tags=["incidents"], dependencies=[Depends(_known_query)])
+
+
+@_incidents.get("", response_model=models.Incidents, responses=_TABLES)
+def list_incidents(  # one argument per query parameter
+    request: Request,
+    backend: BackendHere,
+    caller: Caller,
+    response: Response,
+    media: Media,
+    *,
+    state: Annotated[list[IncidentState] | None, Query(description="May be repeated.")] = None,
+    kind: Annotated[list[IncidentKind] | None, Query(description="May be repeated.")] = None,
+    severity: Annotated[list[Severity] | None, Query(description="May be repeated.")] = None,
+    feeder: Annotated[str | None, Query(pattern=_NAME)] = None,
+    meter: Annotated[str | None, Query(pattern=_NAME)] = None,
+    since: Since = None,
+    until: Until = None,
+    text: Words = None,
+    assigned_to: Annotated[
+        str | None, Query(max_length=64, description="Of this person; empty: none.")
+    ] = None,
+    shelved: Annotated[bool | None, Query(description="Only shelved ones, or only others.")] = None,
+    planned: Annotated[bool | None, Query(description="Only under planned work, or only others.")] = None,
+    sort: Annotated[
+        Literal["onset", "severity", "last"], Query(description="Latest, or most severe, first.")
+    ] = "onset",
+    cursor: Cursor = None,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+) -> Any:
+    """A page of incidents; `since` and `until` refer to `t_first` and `t_last`."""
+    _within(caller, feeder)
+    response.headers["Cache-Control"] = "no-store"
+    last_event = backend.store.last_incident_event
+    unstored, trouble = backend.unstored()
+    scope = None if caller.feeders is None else sorted(caller.feeders)
+    page, following = backend.store.incidents(
+        state=state or (),
+        kind=kind or (),
+        severity=severity or (),
+        feeder=feeder,
+        among=scope,
+        meter=meter,
+        since=since,
+        until=until,
+        text=text,
+        assigned_to=assigned_to,
+        shelved=shelved,
+        planned=planned,
+        sort=sort,
+        cursor=cursor,
+        limit=limit,
+    )
+    if not page and (feeder is not None or meter is not None):
+        _check_filters(backend, caller, feeder, meter)
+    _link(request, response, media, **({} if following is None else {"cursor": following}))
+    if media != tables.JSON:
+        return _as_table(response, tables.encoded(tables.incidents(page), media), media)
+    return models.Incidents(
+        incidents=page,
+        next=following,
+        last_event=last_event,
+        raised=backend.store.open_incidents(among=scope),
+        unstored=unstored,
+        problem=trouble,
+    )
+
+
+@_incidents.get("/events")
+def list_incident_events(
+    backend: BackendHere,
+    caller: Caller,
+    after: Annotated[int, Query(ge=0, le=MAX_EVENT, description="Only events with a higher number.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+) -> models.IncidentEvents:
+    """A page of the events of all incidents, oldest first."""
+    found = backend.store.incident_events_after(after, limit=limit + 1)
+    page = found[:limit]
+    return models.IncidentEvents(
+        events=[event for event in page if caller.sees(event.incident.feeder)],
+        next=page[-1].seq if len(found) > limit else None,
+    )
+
+
+@_incidents.get(
+    "/stream", response_class=EventSourceResponse, dependencies=[Depends(_slot)], tags=["streams"]
+)
+async def stream_incidents(  # noqa: PLR0917  # one argument per query parameter
+    request: Request,
+    backend: BackendHere,
+    caller: Caller,
+    feeder: Annotated[str | None, Query(pattern=_NAME, description="Restrict to this feeder.")] = None,
+    after: Annotated[int | None, Query(ge=0, description="Begin after this event number.")] = None,
+    last_event_id: Annotated[int | None, Header(ge=0, description="Takes precedence over `after`.")] = None,
+) -> AsyncIterator[ServerSentEvent]:
+    """Server-sent events `incident`, with event numbers as ids: with `Last-Event-ID` none is missed.
+
+    Without it and without `after`, the stream starts with the next event.
+    """
+    _within(caller, feeder)
+    store = backend.store
+    start = last_event_id if last_event_id is not None else after
+    newest = store.last_incident_event
+    seen = newest if start is None else min(start, newest)
+    yield ServerSentEvent(comment="connected", id=str(seen), retry=2000)
+    permission = _Permission(request, caller)
+    async for _ in wakes(backend):
+        if not await permission.lasts():
+            return
+        while seen < (newest := store.last_incident_event):
+            try:
+                events = await to_thread.run_sync(partial(store.incident_events_after, seen, feeder=feeder))
+            except StoreUnavailable:
+                return  # The client reconnects with the number of its last event.
+            for event in events:
+                seen = event.seq
+                if caller.sees(event.incident.feeder):
+                    data = _INCIDENT_EVENT.dump_json(event).decode()
+                    yield ServerSentEvent(event="incident", id=str(event.seq), raw_data=data)
+            if not events:
+                seen = newest
+
+
+@_incidents.get("/{incident_id}")
+def get_incident(backend: BackendHere, caller: Caller, incident_id: IncidentId) -> Incident:
+    """One incident."""
+    return _incident(backend, caller, incident_id)
+
+
+def _incident(backend: Backend, caller: Identity, incident_id: str) -> Incident:
+    """An incident within the caller's scope."""
+    incident = backend.store.incident(incident_id)
+    if incident is None or not caller.sees(incident.feeder):
+        raise IncidentUnknown(incident_id)
+    return incident
+
+
+@_incidents.get("/{incident_id}/events")
+def get_incident_events(
+    backend: BackendHere,
+    caller: Caller,
+    incident_id: IncidentId,
+    after: Annotated[int, Query(ge=0, le=MAX_EVENT, description="Only events with a higher number.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+) -> models.IncidentEvents:
+    """A page of events of an incident, oldest first."""
+    _incident(backend, caller, incident_id)
+    found = backend.store.incident_events(incident_id, after=after, limit=limit + 1)
+    page = found[:limit]
+    return models.IncidentEvents(events=page, next=page[-1].seq if len(found) > limit else None)
+
+
+@_incidents.post("/{incident_id}/ack", dependencies=[Depends(_json_only)])
+async def acknowledge_incident(
+    backend: BackendHere, caller: Caller, incident_id: IncidentId, answer: models.IncidentAcknowledgement
+) -> Incident:
+    """Acknowledge all active alarms of an incident."""
+    who = _operator(caller, answer.who)
+    await to_thread.run_sync(_incident, backend, caller, incident_id)
+    return await backend.operate(
+        lambda act: act.acknowledge_incident(incident_id, who, answer.comment, count=answer.count)
+    )
+
+
+@_incidents.post("/{incident_id}/unack", dependencies=[Depends(_json_only)])
+async def withdraw_acknowledgements(
+    backend: BackendHere, caller: Caller, incident_id: IncidentId, answer: models.Withdrawal
+) -> Incident:
+    """Withdraw the acknowledgements of all active alarms of an incident."""
+    who = _operator(caller, answer.who)
+    await to_thread.run_sync(_incident, backend, caller, incident_id)
+    return await backend.operate(lambda act: act.unacknowledge_incident(incident_id, who, answer.comment))
+
+
+@_incidents.post("/{incident_id}/comment", dependencies=[Depends(_json_only)])
+async def comment_incident(
+    backend: BackendHere, caller: Caller, incident_id: IncidentId, answer: models.Remark
+) -> Incident:
+    """Add a comment to an incident; it is an event of the incident."""
+    who = _operator(caller, answer.who)
+    await to_thread.run_sync(_incident, backend, caller, incident_id)
+    return await backend.operate(lambda act: act.comment_incident(incident_id, who, answer.comment))
+
+
+@_incidents.post("/{incident_id}/assign", dependencies=[Depends(_json_only)])
+async def assign_incident(
+    backend: BackendHere, caller: Caller, incident_id: IncidentId, answer: models.Assignment
+) -> Incident:
+    """Assign an incident to a person, or with `to` null to none."""
+    who = _operator(caller, answer.who)
+    await to_thread.run_sync(_incident, backend, caller, incident_id)
+    return await backend.operate(lambda act: act.assign(incident_id, answer.to, who, answer.comment))
+
+
+# ------------------------------------------------- shelves, planned work, shift
+
+_shelves = APIRouter(prefix="/api/v1/shelves", tags=["incidents"], dependencies=[Depends(_known_query)])
+_works = APIRouter(prefix="/api/v1/planned-work", tags=["incidents"], dependencies=[Depends(_known_query)])
+_shift = APIRouter(prefix="/api/v1", tags=["incidents"], dependencies=[Depends(_known_query)])
+Standing = Annotated[bool, Query(description="Leave out those that have ended.")]
+
+
+def _scope(caller: Identity) -> list[str] | None:
+    return None if caller.feeders is None else sorted(caller.feeders)
+
+
+@_shelves.get("")
+def list_shelves(
+    backend: BackendHere,
+    caller: Caller,
+    *,
+    feeder: Annotated[str | None, Query(pattern=_NAME)] = None,
+    standing: Standing = True,
+) -> models.Shelves:
+    """Shelves, newest first."""
+    _within(caller, feeder)
+    found = backend.store.shelves(standing=standing, feeder=feeder, among=_scope(caller))
+    return models.Shelves(shelves=found, max_duration_s=backend.shelve_most_s)
+
+
+@_shelves.post("", status_code=201, dependencies=[Depends(_json_only)])
+async def shelve(backend: BackendHere, caller: Caller, wanted: models.Shelving) -> Shelf:
+    """Shelve an alarm, an incident, or alarms of a feeder: they do not notify until the end of the shelf."""
+    who = _operator(caller, wanted.who)
+    await to_thread.run_sync(_check_shelf, backend, caller, wanted)
+    request = ShelfRequest(
+        wanted.feeder,
+        wanted.alarm,
+        wanted.incident,
+        wanted.meter,
+        wanted.kind,
+        wanted.severity,
+        wanted.duration_s,
+        wanted.reason,
+    )
+    return await backend.operate(lambda act: act.shelve(request, who))
+
+
+def _check_shelf(backend: Backend, caller: Identity, wanted: models.Shelving) -> None:
+    """Refuse what does not exist in the caller's scope."""
+    if wanted.alarm is not None:
+        _alarm(backend, caller, wanted.alarm)
+    if wanted.incident is not None:
+        _incident(backend, caller, wanted.incident)
+    if wanted.feeder is not None:
+        _within(caller, wanted.feeder)
+        _known_feeder(backend, wanted.feeder)
+        if wanted.meter is not None and not _has(backend, wanted.feeder, wanted.meter):
+            raise HTTPException(404, f"feeder {wanted.feeder!r} has no meter {wanted.meter!r}")
+
+
+@_shelves.post("/{shelf_id}/end", dependencies=[Depends(_json_only)])
+async def end_shelf(
+    backend: BackendHere, caller: Caller, shelf_id: ShelfId, answer: models.Withdrawal
+) -> Shelf:
+    """End a shelf before its time."""
+    who = _operator(caller, answer.who)
+    found = await to_thread.run_sync(backend.store.shelf, shelf_id)
+    if found is None or not caller.sees(found.feeder):
+        raise ShelfUnknown(shelf_id)
+    return await backend.operate(lambda act: act.unshelve(shelf_id, who, answer.comment))
+
+
+@_works.get("")
+def list_planned_work(
+    backend: BackendHere,
+    caller: Caller,
+    *,
+    feeder: Annotated[str | None, Query(pattern=_NAME)] = None,
+    standing: Standing = True,
+) -> models.PlannedWorks:
+    """Planned works, newest first; `standing` includes future ones."""
+    _within(caller, feeder)
+    found = backend.store.works(standing=standing, feeder=feeder, among=_scope(caller))
+    return models.PlannedWorks(planned_work=found)
+
+
+@_works.post("", status_code=201, dependencies=[Depends(_json_only)])
+async def plan_work(backend: BackendHere, caller: Caller, wanted: models.WorkRequest) -> PlannedWork:
+    """Enter planned work on a feeder: its alarms are marked and do not notify."""
+    who = _operator(caller, wanted.who)
+    _within(caller, wanted.feeder)
+    _known_feeder(backend, wanted.feeder)
+    return await backend.operate(
+        lambda act: act.plan_work(wanted.feeder, wanted.t_from, wanted.t_until, who, wanted.reason)
+    )
+
+
+@_works.post("/{work_id}/end", dependencies=[Depends(_json_only)])
+async def end_work(
+    backend: BackendHere, caller: Caller, work_id: WorkId, answer: models.Withdrawal
+) -> PlannedWork:
+    """End planned work before its time, or cancel it."""
+    who = _operator(caller, answer.who)
+    found = await to_thread.run_sync(backend.store.work, work_id)
+    if found is None or not caller.sees(found.feeder):
+        raise WorkUnknown(work_id)
+    return await backend.operate(lambda act: act.end_work(work_id, who, answer.comment))
+
+
+@_shift.get("/hand-over")
+def get_hand_over(
+    backend: BackendHere,
+    caller: Caller,
+    response: Response,
+    since: Annotated[float, Query(allow_inf_nan=False, description="Begin of the comments, Unix s.")],
+) -> models.HandOver:
+    """State of the shift: open incidents, shelves, planned work, and comments since a time."""
+    response.headers["Cache-Control"] = "no-store"
+    scope, store = _scope(caller), backend.store
+    open_states = (IncidentState.RAISED, IncidentState.ACKNOWLEDGED)
+    return models.HandOver(
+        t=time.time(),
+        since=since,
+        incidents=store.incidents(state=open_states, among=scope, sort="severity", limit=1000)[0],
+        shelves=store.shelves(standing=True, among=scope),
+        planned_work=store.works(standing=True, among=scope),
+        comments=store.said(since, among=scope),
+    )
 
 
 # ----------------------------------------------------------------- operations
@@ -873,6 +1296,59 @@ def _probe(request: Request, good: bool, reasons: list[str], what: str) -> Any:
 def metrics(backend: BackendHere) -> Response:
     """Metrics in Prometheus's text format."""
     return Response(backend.metrics(), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+# -------------------------------------------------------------- notifications
+
+_notifications = APIRouter(
+    prefix="/api/v1/notifications", tags=["notifications"], dependencies=[Depends(_known_query)]
+)
+
+
+@_notifications.get("")
+def list_targets(request: Request) -> models.Targets:
+    """Targets of notifications, with their position and the problem of the last attempt."""
+    notifier: Notifier | None = request.app.state.notifier
+    return models.Targets(targets=[] if notifier is None else notifier.status())
+
+
+@_notifications.get("/dead-letters")
+def list_dead_letters(
+    request: Request,
+    target: Annotated[str | None, Query(pattern=_NAME, description="Restrict to this target.")] = None,
+    after: Annotated[int, Query(ge=0, le=MAX_EVENT, description="Only letters with a higher number.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+) -> models.Letters:
+    """A page of messages that were given up, oldest first."""
+    notifier: Notifier | None = request.app.state.notifier
+    found = [] if notifier is None else notifier.store.letters(target=target, after=after, limit=limit + 1)
+    page = [
+        models.Letter.model_validate({**asdict(each), "message": json.loads(each.body)})
+        for each in found[:limit]
+    ]
+    return models.Letters(dead_letters=page, next=page[-1].id if len(found) > limit else None)
+
+
+@_notifications.post("/dead-letters/resend", dependencies=[Depends(_json_only)])
+def resend_dead_letters(request: Request, choice: models.LetterChoice) -> models.LetterCount:
+    """Send dead letters again, with the same message ids; a delivered one is deleted."""
+    notifier: Notifier | None = request.app.state.notifier
+    if notifier is None:
+        return models.LetterCount(count=0)
+    count = notifier.store.resend(target=choice.target, ids=choice.ids)
+    notifier.look()
+    return models.LetterCount(count=count)
+
+
+@_notifications.post("/dead-letters/discard", dependencies=[Depends(_json_only)])
+def discard_dead_letters(request: Request, choice: models.LetterChoice) -> models.LetterCount:
+    """Delete dead letters."""
+    notifier: Notifier | None = request.app.state.notifier
+    if notifier is None:
+        return models.LetterCount(count=0)
+    count = notifier.store.discard(target=choice.target, ids=choice.ids)
+    notifier.look()
+    return models.LetterCount(count=count)
 
 
 # ------------------------------------------------------------------- sessions

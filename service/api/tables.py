@@ -14,6 +14,7 @@ from typing import Any, Final
 
 import pyarrow as pa
 
+from service.alarms.incidents import Incident, incident_json
 from service.alarms.state_machine import Alarm, to_json
 from service.store.series import EXTREMES, VERDICTS, Series
 
@@ -73,6 +74,34 @@ _ALARMS: dict[str, Any] = {
     "t_acknowledged": _TIME,
     "comment": _TEXT,
     "evidence": _TEXT,
+    "incident": _TEXT,
+    "shelved_until": _TIME,
+    "planned_work": _TEXT,
+}
+_INCIDENTS: dict[str, Any] = {
+    "id": _TEXT,
+    "kind": _TEXT,
+    "feeder": _TEXT,
+    "severity": _TEXT,
+    "state": _TEXT,
+    "count": pa.int64(),
+    "alarms": pa.int64(),
+    "active": pa.int64(),
+    "unacknowledged": pa.int64(),
+    "kinds": pa.list_(_TEXT),
+    "meters": pa.list_(_TEXT),
+    "customers": pa.list_(_TEXT),
+    "t_first": _TIME,
+    "t_last": _TIME,
+    "t_cleared": _TIME,
+    "reason": _TEXT,
+    "acknowledged_by": _TEXT,
+    "t_acknowledged": _TIME,
+    "assigned_to": _TEXT,
+    "comments": pa.int64(),
+    "shelved_until": _TIME,
+    "planned_work": _TEXT,
+    "planned_until": _TIME,
 }
 _PREFIXED: Final = ("seen", "suspect", "model_only")
 """Fields of a meter with the name of a field of the whole feeder."""
@@ -158,9 +187,15 @@ def series_table(fields: Mapping[str, Any]) -> pa.Table:
     return _table(rows, _SERIES)
 
 
+def incidents(found: Iterable[Incident]) -> pa.Table:
+    """Return incidents as a table."""
+    return _table([incident_json(incident) for incident in found], _INCIDENTS)
+
+
 def alarms(found: Sequence[Alarm]) -> pa.Table:
     """Return alarms as a table; the column `evidence` is JSON."""
-    rows = [to_json(alarm) for alarm in found]
+    shown = ("incident", "shelved_until", "planned_work")
+    rows = [to_json(alarm) | {name: getattr(alarm, name, None) for name in shown} for alarm in found]
     texts = [{**row, "evidence": json.dumps(row["evidence"], ensure_ascii=False)} for row in rows]
     return _table(texts, _ALARMS)
 

@@ -148,6 +148,15 @@ def show(
     console.out.print(table)
 
 
+def audit_command(database: str, action: str, target: str, detail: str) -> None:
+    """Append an entry of a command to the audit log, if the service has one."""
+    from service.store.access import AccessStore
+
+    with AccessStore(database) as store:
+        if store.any_key():
+            _audit(store, time.time(), action, target, detail)
+
+
 def _audit(store: AccessStore, now: float, action: str, target: str, detail: str) -> None:
     import getpass
     import os

@@ -28,7 +28,8 @@ def backup(
 ) -> None:
     """Write a database to a file, also while a service runs.
 
-    SQLite: keys and audit log, `<database>.access`, go to FILE.access. PostgreSQL needs `pg_dump`.
+    SQLite: `<database>.access` (keys, audit log) goes to FILE.access, `<database>.notify` to FILE.notify.
+    PostgreSQL needs `pg_dump`.
     """
     from service.settings import settings
     from service.store.backup import backup as run

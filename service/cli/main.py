@@ -27,6 +27,7 @@ from service.cli import (
     console,
     doctor,
     feeders,
+    notify,
     pki,
     replay,
     reproduce,
@@ -110,6 +111,7 @@ def gridsec(
 app.add_typer(feeders.app, name="feeders")
 app.add_typer(access.key_app, name="key")
 app.add_typer(access.audit_app, name="audit")
+app.add_typer(notify.app, name="notify")
 app.command("convert")(feeders.convert)
 app.command()(doctor.doctor)
 app.command()(backup.backup)

@@ -52,6 +52,9 @@ Grace = Annotated[
 ]
 MaxPayload = Annotated[int | None, typer.Option(help="Largest payload, bytes. [default: 262144]")]
 Queue = Annotated[int | None, typer.Option(help="Length of the queue, payloads. [default: 20000]")]
+MaxShelve = Annotated[
+    float | None, typer.Option("--max-shelve", help="Longest time of a shelf of alarms, h. [default: 24]")
+]
 MaxFeeders = Annotated[int | None, typer.Option(help="Largest number of feeders over REST. [default: 100]")]
 OidcIssuer = Annotated[
     str | None, typer.Option(help="Issuer of bearer tokens (OpenID Connect), e.g. https://login.example.")
@@ -86,6 +89,9 @@ Plaintext = Annotated[
         "--plaintext-network", help="Dangerous: zenoh without TLS beyond loopback; any machine can publish."
     ),
 ]
+Notify = Annotated[
+    Path | None, typer.Option(help="File (TOML) with targets of notifications: webhooks, Alertmanager.")
+]
 LogLevel = Annotated[str | None, typer.Option(help="debug, info, warning or error. [default: info]")]
 LogFormat = Annotated[str | None, typer.Option(help="console or json. [default: console]")]
 STOP_S = 2.7
@@ -111,6 +117,7 @@ def serve(
     max_payload: MaxPayload = None,
     queue: Queue = None,
     max_feeders: MaxFeeders = None,
+    max_shelve: MaxShelve = None,
     oidc_issuer: OidcIssuer = None,
     oidc_audience: OidcAudience = None,
     oidc_jwks: OidcJwks = None,
@@ -119,6 +126,7 @@ def serve(
     meter_keys: MeterKeysFile = None,
     unsigned: Unsigned = None,
     plaintext_network: Plaintext = False,
+    notify: Notify = None,
     log_level: LogLevel = None,
     log_format: LogFormat = None,
     until_eof: UntilEof = False,
@@ -155,6 +163,7 @@ def serve(
             "max_payload": max_payload,
             "queue": queue,
             "max_feeders": max_feeders,
+            "max_shelve_h": max_shelve,
             "oidc_issuer": oidc_issuer,
             "oidc_audience": oidc_audience,
             "oidc_jwks": oidc_jwks,
@@ -163,6 +172,7 @@ def serve(
             "meter_keys": meter_keys,
             "unsigned": unsigned,
             "plaintext_network": plaintext_network or None,
+            "notify": notify,
             "log_level": log_level,
             "log_format": log_format,
         }

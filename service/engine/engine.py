@@ -27,6 +27,7 @@ import structlog
 from feeders.model.site import Site
 from gridsec.errors import GridsecError
 from service.access.signing import MeterKeys
+from service.alarms.incidents import event_json
 from service.alarms.state_machine import (
     Alarm,
     AlarmRules,
@@ -39,6 +40,7 @@ from service.alarms.state_machine import (
 from service.alarms.state_machine import to_json as alarm_json
 from service.engine.commissioning import CommissioningProgress, FeederCommissioning
 from service.engine.feeder_monitor import FeederMonitor, Suspicions, TickResult, align_rules, known_of
+from service.engine.operators import SHELVE_MOST_S, Operators
 from service.errors import FeederUnknown
 from service.ingest.align import Clock, ReadingOutcome
 from service.ingest.queues import Sample
@@ -53,9 +55,9 @@ from service.ingest.reading import (
     head_of,
 )
 from service.metrics import Metrics
-from service.report.report import FeederReport, to_text
+from service.report.report import BUSBAR, FeederReport, to_text
 from service.store import Rejected, Store
-from service.store.committer import Committer, Executor, Wish, alarm_key, inline
+from service.store.committer import Committer, Executor, Wish, alarm_key, incident_key, inline
 from service.store.schema import CommissioningEvent
 from service.store.state_codec import StateSnapshot
 
@@ -192,6 +194,7 @@ class RuntimeConfig:
     max_payload: int = 256 * 1024  # size of the largest accepted payload, bytes
     max_samples: int = 20_000  # length of the queue before the runtime, samples
     max_feeders: int = 100  # largest number of feeders added at run time, besides those given at the start
+    shelve_most_s: float = SHELVE_MOST_S  # longest time of a shelf, s
     meter_keys: MeterKeys | None = None  # keys of meters; None accepts readings without signature
 
 
@@ -238,7 +241,8 @@ class Engine:
         self.reported: dict[str, float] = {}
         self._wall, self._stored, self._continues = wall, stored, go_on
         self._catch_up = CatchUp(clock, waits=config.clock is Clock.EVENTS)
-        self.committer = Committer(store, self.metrics, stored, self._count_stored, apart)
+        self.committer = Committer(store, self.metrics, stored, self._count_stored, apart, wall=wall)
+        self.operators = Operators(self, wall, config.shelve_most_s)
         self._wire = Wire({}, config.prefix, config.max_payload, config.meter_keys)
         for site in sites:
             self.add(site)
@@ -354,6 +358,10 @@ class Engine:
             for alarm in standing:
                 if alarm.feeder in ours:
                     self.committer.publisher.answer(alarm_key(alarm), msgspec.json.encode(alarm_json(alarm)))
+            for event in self.store.open_incident_events():
+                if event.incident.feeder in ours:
+                    payload = msgspec.json.encode(event_json(event))
+                    self.committer.publisher.answer(incident_key(event.incident), payload)
         for name in self.unloaded:
             self.metrics.alarms.labels(name).set(sum(alarm.feeder == name for alarm in standing))
         self.committer.commit()
@@ -404,6 +412,7 @@ class Engine:
                 break
             decoded = self._decode(sample)
             bad.extend(self._note(problem, sample) for problem in decoded.bad)
+            self._refuse_identities(decoded.bad)
             for reading in decoded.readings:
                 monitor = self.monitors[reading.feeder]
                 lost.setdefault(monitor.name, monitor.aligner.lost)
@@ -418,6 +427,17 @@ class Engine:
         for name, before in lost.items():
             self.metrics.lost.labels(name).inc(self.monitors[name].aligner.lost - before)
         return bad
+
+    def _refuse_identities(self, bad: Iterable[BadReading]) -> None:
+        """Pass readings with a wrong signature or sender to the monitors of their feeders."""
+        for problem in bad:
+            monitor = self.monitors.get(problem.feeder or "")
+            if problem.reason is not BadReason.SIGNATURE or monitor is None:
+                continue
+            # The last entry of a long batch has no meter; those before it have.
+            meter = problem.meter or (BUSBAR if "/substation/" in problem.key else None)
+            if meter is not None:
+                monitor.refuse(meter, problem.problems[0])
 
     def _judge(self) -> list[TickResult]:
         """Evaluate the pending ticks within the time budget; count skipped ones."""
@@ -544,7 +564,7 @@ class Engine:
             transition = acknowledged(alarm, who, comment, t, count=count)
 
             def landed() -> Alarm:
-                self._acknowledged(transition.alarm)
+                self.carry_over(transition.alarm)
                 return transition.alarm
 
             self.committer.store(Wish((transition,)), _landing(answer, landed), partial(_refuse, answer))
@@ -557,8 +577,8 @@ class Engine:
             store(held)
         return answer
 
-    def _acknowledged(self, alarm: Alarm) -> None:
-        """Copy a stored acknowledgement to the book, and to results since the start of the write."""
+    def carry_over(self, alarm: Alarm) -> None:
+        """Copy a stored acknowledgement, or its withdrawal, to the book and to later results."""
         self.committer.waiting.carry(alarm)
         monitor = self.monitors.get(alarm.feeder)
         if monitor is None:

@@ -23,13 +23,14 @@ from feeders.registry import DesignedEstimator, WarmStart
 from gridsec.estimators.sequential import SuspicionRecord
 from gridsec.interface import Cause
 from service.alarms import displayed
-from service.alarms.conditions import conditions
-from service.alarms.state_machine import AlarmBook, AlarmRules, AlarmTransition, advance, hold
+from service.alarms.conditions import conditions, identity_mismatches
+from service.alarms.state_machine import INCIDENT_S, AlarmBook, AlarmRules, AlarmTransition, advance, hold
 from service.engine.commissioning import FeederCommissioning
 from service.ingest.align import Aligner, AlignRules, Clock, ReadingOutcome, Tick, rules
 from service.ingest.reading import Known, Reading
 from service.report import feeder_info
 from service.report.report import (
+    BUSBAR,
     DataErrors,
     FeederReport,
     blind,
@@ -106,6 +107,8 @@ class Suspicions:
 POWER_MAX_FACTOR = 100.0
 """Largest plausible power over the feeder's base power."""
 
+MISMATCH_S = 60.0
+"""Time for which a refused identity is a condition, s; at least two ticks."""
 PATIENCE_MIN_S = 5.0
 """Lower limit of `patience_s`, s."""
 
@@ -152,7 +155,12 @@ def align_rules(
 def alarm_rules(site: Site, times: AlignRules) -> AlarmRules:
     """Return the delays of a feeder's alarms."""
     settings = site.tables.meta.monitor
-    return AlarmRules(settings.on_delay_s, settings.off_delay_s, silence_s=times.silence_s)
+    return AlarmRules(
+        settings.on_delay_s,
+        settings.off_delay_s,
+        silence_s=times.silence_s,
+        incident_s=max(INCIDENT_S, 2.0 * times.tick_s),
+    )
 
 
 def design(site: Site, progress: Callable[[int, int], None] | None = None) -> registry.DesignedEstimator:
@@ -203,6 +211,11 @@ class FeederMonitor:
         self._display: displayed.Display | None = None
         self._data_errors = DataErrors(site)
         self._power_ages = PowerAges(site)
+        # Meters that have had no reading since the start and are not silent yet.
+        self._connecting = {BUSBAR, *site.meter_ids}
+        # Problems of refused identities by meter: since the last tick, and with the tick of the latest one.
+        self._refused: dict[str, str] = {}
+        self._mismatches: dict[str, tuple[float, str]] = {}
         self._watcher: registry.DesignedEstimator | None = None
         self._state: Any = None
 
@@ -242,6 +255,23 @@ class FeederMonitor:
         outcome, ticks = self.aligner.take(reading, now)
         self.pending.extend(ticks)
         return outcome
+
+    def refuse(self, meter: str, problem: str) -> None:
+        """Note a reading that was refused for its identity; a condition from the next tick on."""
+        self._refused[meter] = problem
+
+    def _mismatched(self, t: float) -> dict[str, str]:
+        """Problems of refused identities within the last `MISMATCH_S` before a tick, by meter."""
+        self._mismatches |= {meter: (t, problem) for meter, problem in self._refused.items()}
+        self._refused.clear()
+        hold_s = max(MISMATCH_S, 2.0 * self.aligner.rules.tick_s)
+        # After the clock was set back, a later time would hold the condition for longer.
+        self._mismatches = {
+            meter: (at, problem)
+            for meter, (at, problem) in self._mismatches.items()
+            if 0.0 <= t - at <= hold_s
+        }
+        return {meter: problem for meter, (_, problem) in self._mismatches.items()}
 
     def reach(self, now: float) -> None:
         """Add the ticks that are due without a new reading to the pending ones."""
@@ -286,10 +316,12 @@ class FeederMonitor:
         book = self.book
         if tick.skipped:
             book = hold(book, tick.t - tick.skipped * self.aligner.rules.tick_s)
+        mismatches = identity_mismatches(self.name, self._mismatched(tick.t))
         for _ in range(2):  # monitored, then failed
             try:
                 report, display = self._complete(self._judge(tick))
-                after, transitions = advance(book, self._alarm_rules, conditions(report), report.t)
+                found = [*conditions(report, connecting=self._connects(report)), *mismatches]
+                after, transitions = advance(book, self._alarm_rules, found, report.t)
             except Exception as error:  # noqa: BLE001 - ticks before and after keep their verdicts
                 self.break_down(error)
             else:
@@ -297,6 +329,15 @@ class FeederMonitor:
                 return TickResult(report, transitions)
         self.report, self._display = self._complete(self._judge(tick))
         return TickResult(self.report, ())
+
+    def _connects(self, report: FeederReport) -> bool:
+        """True while a meter has had no reading since the start and is not silent yet."""
+        if self._connecting:
+            self._connecting -= {meter.meter for meter in report.meters if meter.seen}
+            self._connecting -= {one.meter for one in report.silent}
+            if report.busbar.seen:
+                self._connecting.discard(BUSBAR)
+        return bool(self._connecting)
 
     def _complete(self, report: FeederReport) -> tuple[FeederReport, displayed.Display]:
         """The report with revision, newest tick with a reading, and start and display of the verdict."""

@@ -27,9 +27,11 @@ from service.engine import design_jobs
 from service.engine.commissioning import CommissioningProgress
 from service.engine.engine import Engine, RuntimeConfig
 from service.engine.feeder_monitor import FeederMonitor, Phase
+from service.engine.operators import Operators
 from service.errors import FeederFixed, TooManyFeeders
 from service.ingest.align import Clock
 from service.ingest.queues import Inbox, Sample
+from service.metrics import Metrics
 from service.report import feeder_info
 from service.report.report import FeederReport
 from service.store import OutcomeUnknown, Store, StoreUnavailable
@@ -364,6 +366,11 @@ class Runtime:
         keeper = self._engine.committer
         return len(keeper.waiting), "; ".join(keeper.problems()) or None
 
+    @property
+    def counters(self) -> Metrics:
+        """Counters and gauges of the service."""
+        return self._engine.metrics
+
     def metrics(self) -> bytes:
         """Return the metrics in Prometheus's text format."""
         return self._engine.metrics.exposition()
@@ -444,6 +451,15 @@ class Runtime:
     async def acknowledge(self, alarm_id: str, who: str, comment: str, *, count: int | None = None) -> Alarm:
         """Acknowledge an alarm as `Engine.acknowledge` does; it is stored when this returns."""
         return await self._command(partial(self._engine.acknowledge, alarm_id, who, comment, count=count))
+
+    async def operate(self, action: Callable[[Operators], Future[T]]) -> T:
+        """Execute an action of an operator between two rounds; it is stored when this returns."""
+        return await self._command(partial(action, self._engine.operators))
+
+    @property
+    def shelve_most_s(self) -> float:
+        """Longest time of a shelf, s."""
+        return self._engine.operators.shelve_most_s
 
     async def recommission(
         self, name: str, meters: Sequence[str], who: str, reason: str

@@ -164,7 +164,8 @@ class Bus:
             subscriber = live.declare_subscriber(f"{self._prefix}/**", ring, allowed_origin=remote)
             stack.callback(subscriber.undeclare)
             self._start("zenoh readings", self._receive, subscriber.handler)
-            for key in (f"{self._prefix}/*/estimate", f"{self._prefix}/*/alarm/*"):
+            for kind in ("estimate", "alarm/*", "incident/*"):
+                key = f"{self._prefix}/*/{kind}"
                 queryable = live.declare_queryable(key, zenoh.handlers.FifoChannel(QUERIES_WAITING))
                 stack.callback(queryable.undeclare)
                 self._start(f"zenoh queries {key}", self._answer, queryable.handler)
@@ -210,7 +211,7 @@ class Bus:
     def _published_by_others(self, key: str) -> bool:
         """True for keys that another service with this prefix publishes."""
         match key.removeprefix(f"{self._prefix}/").split("/"):
-            case [_, "estimate"] | [_, "alarm", _]:
+            case [_, "estimate"] | [_, "alarm" | "incident", _]:
                 return True
         return False
 

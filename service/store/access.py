@@ -1,38 +1,29 @@
 """Database of access control: API keys, sessions of the web page, and the audit log.
 
-It is apart from the service's database, since the command line writes it while the service runs. With SQLite
-it is the file `<database>.access`, with a rollback journal: unlike a WAL, several processes write it safely.
-With PostgreSQL its tables are in the same database. Entries of the audit log are appended one at a time,
-under `BEGIN IMMEDIATE` or an advisory lock of the transaction.
+It is apart from the service's database, since the command line writes it while the service runs: the file
+`<database>.access`, or tables in a PostgreSQL database. Entries of the audit log are appended one at a
+time, under `BEGIN IMMEDIATE` or an advisory lock of the transaction.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import sqlite3
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, Final
-from urllib.parse import quote
 
 import sqlalchemy as sa
 
 from service.access.audit import AuditEntry, chained
 from service.access.identity import Role
 from service.access.keys import KeyRecord
-from service.store.connect import CALL_S, Timed
-from service.store.schema import SEQ, StoreUnavailable
+from service.store.schema import SEQ
+from service.store.shared import SharedDatabase
 
 SESSION_S: Final = 12 * 3600.0
 """Life of a session of the web page, s: a shift and its hand-over."""
-BUSY_S: Final = 5.0
-"""Wait of a write for the lock of the database, s."""
+SUFFIX: Final = ".access"
+"""Suffix of the file beside an SQLite database."""
 _AUDIT_LOCK: Final = 0x6772_6964_6175_6400
-_VERSION: Final = 1
-
 _LENGTHS: Final = (64, 256, 256, 1024, 2000)
 """Largest lengths of identity, credential, action, target and detail of an audit entry, characters."""
 
@@ -72,7 +63,7 @@ _AUDIT = sa.Table(
 )
 
 
-class AccessStore:
+class AccessStore(SharedDatabase):
     """Keys, sessions and audit log of one service. Methods block and are thread-safe.
 
     database: address of the service's database.
@@ -80,31 +71,11 @@ class AccessStore:
     """
 
     def __init__(self, database: str) -> None:
-        try:
-            url = sa.make_url(database)
-        except sa.exc.ArgumentError as error:
-            text = f"{database!r} is not a database address: {error}"
-            raise StoreUnavailable(text, code="wrong-address") from error
-        self._sqlite = url.get_backend_name() == "sqlite"
-        self.name = url.render_as_string(hide_password=True) + (".access" if self._sqlite else "")
-        self._engine = _sqlite(url) if self._sqlite else _postgresql(url)
-        try:
-            self._create()
-        except BaseException:
-            self.close()
-            raise
+        super().__init__(database, SUFFIX, _META, _SCHEMA, lock=_AUDIT_LOCK)
 
     def __enter__(self) -> AccessStore:
         """Return the store."""
         return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close."""
-        self.close()
-
-    def close(self) -> None:
-        """Close all connections; idempotent."""
-        self._engine.dispose()
 
     # ------------------------------------------------------------------ keys
 
@@ -193,8 +164,7 @@ class AccessStore:
         """
         given = (identity, credential, action, target, detail)
         with self._write() as connection:
-            if not self._sqlite:
-                connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_AUDIT_LOCK)))
+            self._serialise(connection)
             texts = [printable(each, most) for each, most in zip(given, _LENGTHS, strict=True)]
             last = connection.execute(sa.select(_AUDIT).order_by(_AUDIT.c.seq.desc()).limit(1)).one_or_none()
             before = None if last is None else AuditEntry(*last)
@@ -212,43 +182,6 @@ class AccessStore:
         with self._read() as connection:
             return [AuditEntry(*row) for row in connection.execute(query)]
 
-    # -------------------------------------------------------------- internal
-
-    def _create(self) -> None:
-        with self._write() as connection:
-            if not self._sqlite:
-                # Two processes may create the tables at once.
-                connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_AUDIT_LOCK)))
-            if not sa.inspect(connection).has_table(_SCHEMA.name):
-                _META.create_all(connection)
-                connection.execute(_SCHEMA.insert().values(version=_VERSION))
-            version = int(connection.scalar(sa.select(_SCHEMA.c.version)) or 0)
-        if version > _VERSION:
-            text = f"{self.name} has version {version}; this program supports versions up to {_VERSION}"
-            raise StoreUnavailable(text, code="newer-schema")
-
-    @contextmanager
-    def _write(self) -> Iterator[sa.Connection]:
-        with self._guard("write"), self._engine.begin() as connection:
-            if self._sqlite:
-                # A deferred transaction that reads first and then writes fails at once if another one writes.
-                connection.exec_driver_sql("BEGIN IMMEDIATE")
-            yield connection
-
-    @contextmanager
-    def _read(self) -> Iterator[sa.Connection]:
-        with self._guard("read"), self._engine.connect() as connection:
-            yield connection
-
-    @contextmanager
-    def _guard(self, doing: str) -> Iterator[None]:
-        try:
-            yield
-        except (sa.exc.SQLAlchemyError, sqlite3.Error, OSError) as error:
-            cause = " ".join(str(getattr(error, "orig", None) or error).split())
-            code = "read-failed" if doing == "read" else "write-failed"
-            raise StoreUnavailable(f"cannot {doing} {self.name}: {cause}", code=code) from error
-
 
 def printable(text: str, most: int) -> str:
     """Text with escaped control, format and surrogate characters, cut to a length."""
@@ -264,59 +197,3 @@ def _record(row: Any) -> KeyRecord:
     return KeyRecord(
         row.id, row.digest, row.name, Role(row.role), feeders, row.created, row.expires, row.revoked
     )
-
-
-def _sqlite(url: sa.URL) -> sa.Engine:
-    if not url.database or url.database == ":memory:":
-        text = f"{url}: expected a file; a database in memory is lost at the end"
-        raise StoreUnavailable(text, code="in-memory")
-    path = Path(os.path.realpath(url.database) + ".access")
-    try:
-        # Digests of keys: for the owner alone, from the first moment.
-        os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600))
-    except FileExistsError:
-        pass
-    except OSError as error:
-        raise StoreUnavailable(f"cannot write {path}: {error.strerror}", code="write-failed") from error
-
-    def connect() -> sqlite3.Connection:
-        made = sqlite3.connect(
-            f"file:{quote(str(path))}?mode=rw",
-            uri=True,
-            timeout=BUSY_S,
-            isolation_level=None,
-            check_same_thread=False,
-        )
-        made.execute("PRAGMA foreign_keys = ON")
-        made.execute("PRAGMA journal_mode = DELETE")
-        made.execute("PRAGMA synchronous = FULL")
-        return made
-
-    engine = sa.create_engine("sqlite://", creator=connect, poolclass=sa.QueuePool, pool_size=4)
-    sa.event.listen(engine, "connect", lambda _, record: record.info.update(place=_place(path)))
-    sa.event.listen(engine, "checkout", lambda _, record, __: _in_place(path, record.info["place"]))
-    return engine
-
-
-def _place(path: Path) -> tuple[int, int]:
-    found = path.stat()
-    return found.st_dev, found.st_ino
-
-
-def _in_place(path: Path, place: tuple[int, int]) -> None:
-    """Give up connections to a removed or replaced file: its keys are not those of the service any more."""
-    if not path.exists() or _place(path) != place:
-        raise sa.exc.DisconnectionError(f"{path} has been removed or replaced")
-
-
-def _postgresql(url: sa.URL) -> sa.Engine:
-    if url.get_driver_name() != "psycopg":
-        url = url.set(drivername="postgresql+psycopg")
-    wait = {"connect_timeout": int(CALL_S), "tcp_user_timeout": int(CALL_S * 1e3)}
-    limit = f"-c statement_timeout={CALL_S * 1e3:.0f} -c synchronous_commit=on"
-    engine = sa.create_engine(
-        url, pool_size=4, pool_timeout=CALL_S, pool_pre_ping=True, connect_args={**wait, "options": limit}
-    )
-    # A server that stops answering ends neither by its own time limit nor by that of TCP.
-    sa.event.listen(engine, "do_connect", lambda _, __, given, options: Timed.connect(*given, **options))
-    return engine

@@ -1,7 +1,8 @@
 """Backup of a database to a file while a service writes it, and restore into an empty database.
 
 SQLite: the online backup API copies one consistent state by a read-only connection; in WAL mode commits
-continue. `<database>.access` is copied to `FILE.access`. PostgreSQL: `pg_dump` and `pg_restore`.
+continue. `<database>.access` is copied to `FILE.access`, `<database>.notify` to `FILE.notify`. PostgreSQL:
+`pg_dump` and `pg_restore`.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from feeders.util import replace_file
 from service.store.connect import ADVISORY_LOCK, CALL_S
 from service.store.schema import MIGRATIONS, VERSION, StoreUnavailable
 
-ACCESS = ".access"
-"""Suffix of the file of keys and of the audit log, beside an SQLite database and beside its backup."""
+ACCESS, NOTIFY = ".access", ".notify"
+"""Suffixes of files beside an SQLite database and its backup: keys and audit log, notifications."""
 NEWEST = 1 + len(MIGRATIONS)
 """Schema version of this program."""
 _SQLITE, _PG_DUMP = b"SQLite format 3\x00", b"PGDMP"
@@ -74,13 +75,18 @@ def backup(url: str, file: Path) -> list[Copy]:
     path = path_of(source)
     if not path.is_file():
         raise StoreUnavailable(f"cannot open {path}: there is no such file", code="open-failed")
-    copies = [_copied(path, file, schema_version)]
-    keys, other = path.with_name(path.name + ACCESS), file.with_name(file.name + ACCESS)
-    if keys.is_file():
-        copies.append(_copied(keys, other, lambda _: None))
-    else:
-        other.unlink(missing_ok=True)  # of an earlier backup: it does not belong to this one
-    return copies
+    # Positions of notifications first: they are then not beyond the copied events.
+    positions = _copied_beside(path, file, NOTIFY)
+    return [_copied(path, file, schema_version), *positions, *_copied_beside(path, file, ACCESS)]
+
+
+def _copied_beside(path: Path, file: Path, suffix: str) -> list[Copy]:
+    """Copy the file beside a database, if there is one, to the file beside its backup."""
+    source, target = path.with_name(path.name + suffix), file.with_name(file.name + suffix)
+    if source.is_file():
+        return [_copied(source, target, lambda _: None)]
+    target.unlink(missing_ok=True)  # of an earlier backup: it does not belong to this one
+    return []
 
 
 def restore(url: str, file: Path) -> list[Copy]:
@@ -100,18 +106,24 @@ def restore(url: str, file: Path) -> list[Copy]:
         return [_restored_server(target, file)]
     path = path_of(target)
     path.parent.mkdir(parents=True, exist_ok=True)
-    keys, other = path.with_name(path.name + ACCESS), file.with_name(file.name + ACCESS)
     with _writer_lock(path):
         _refuse_content(path)
-        if other.is_file() and keys.exists():
-            raise StoreUnavailable(f"{keys} exists; move it away first", code="not-empty")
+        for suffix in (ACCESS, NOTIFY):
+            beside, copied = path.with_name(path.name + suffix), file.with_name(file.name + suffix)
+            if copied.is_file() and beside.exists():
+                raise StoreUnavailable(f"{beside} exists; move it away first", code="not-empty")
         with closing(_reader(file)) as source:
             version = schema_version(source)
         if version > NEWEST:
             text = f"{file} has schema version {version}; this program supports versions up to {NEWEST}"
             raise StoreUnavailable(text, code="newer-schema")
         # The keys first: a database without its keys would be open to the network.
-        copies = [_copied(other, keys, lambda _: None)] if other.is_file() else []
+        copies = [
+            each
+            for suffix in (ACCESS, NOTIFY)
+            if file.with_name(file.name + suffix).is_file()
+            for each in _copied_beside(file, path, suffix)
+        ]
         return [_copied(file, path, schema_version), *copies]
 
 

@@ -27,6 +27,7 @@ from typing import Any, Protocol, TypeVar
 import msgspec
 import structlog
 
+from service.alarms.incidents import Action, Incident, IncidentEvent, event_json
 from service.alarms.state_machine import Alarm, AlarmTransition, Change, carried
 from service.alarms.state_machine import to_json as alarm_json
 from service.ingest.queues import BusCounts
@@ -226,12 +227,13 @@ class Publisher(Protocol):
 class Wish:
     """Contents of a command's write: all of it is stored, or the command fails."""
 
-    # transitions, kept, happened, without, put: as in `Store.commit`.
+    # transitions, kept, happened, without, put, actions: as in `Store.commit`.
     transitions: tuple[AlarmTransition, ...] = ()
     kept: tuple[StateSnapshot, ...] = ()
     happened: tuple[CommissioningEvent, ...] = ()
     without: str | None = None
     put: tuple[str, Mapping[str, Any]] | None = None
+    actions: tuple[Action, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,10 +253,13 @@ class WriteJob:
     """One write: data, published events, and the next part of the outbox."""
 
     key: int
+    now: float  # wall clock, Unix s
     batch: Batch
     published: tuple[int, ...] = ()
     probe: bool = False
     page_after: int | None = None
+    incidents: tuple[int, ...] = ()  # published events of incidents
+    incidents_after: int = 0  # newest event of an incident that was read for publication
     command: Command | None = None
 
     @property
@@ -271,6 +276,9 @@ class WriteResult:
     numbers: tuple[int, ...] | None = None
     marked: bool = False
     page: tuple[AlarmEvent, ...] | None = None
+    incidents: tuple[IncidentEvent, ...] = ()
+    incidents_after: int | None = None  # number until which they are read
+    incidents_marked: bool = False
     found: Any = None
     error: StoreUnavailable | None = None
 
@@ -304,6 +312,8 @@ class Committer:
         stored: Callable[[], None],
         kept: Callable[[tuple[FeederReport, ...]], None],
         apart: Executor = inline,
+        *,
+        wall: Callable[[], float] = time.time,
     ) -> None:
         self.waiting = WriteQueue(lambda what, count: metrics.forgotten.labels(what).inc(count))
         self.publisher: Publisher | None = None
@@ -312,13 +322,16 @@ class Committer:
         self._store = store
         self._metrics = metrics
         self._stored, self._kept = stored, kept
-        self._apart = apart
+        self._apart, self._wall = apart, wall
         self._retry_at = self._began = 0.0
         self._keys = count(1)
         # A job with an unknown outcome; nothing else is stored before it.
         self._unknown: WriteJob | None = None
         self._published: deque[int] = deque()
         self._unpublished: deque[tuple[int, Alarm]] = deque()
+        self._incidents_done: deque[int] = deque()
+        self._incidents: deque[IncidentEvent] = deque()
+        self._incidents_after = 0
         # The outbox has events after this number that are not in `_unpublished`; None: it has none.
         self._outbox_after: int | None = 0
 
@@ -331,8 +344,16 @@ class Committer:
         if self.storing or (time.monotonic() < self._retry_at and not at_once):
             return
         job = self._unknown or self._job()
-        if job.batch or job.command or job.published or job.probe or job.page_after is not None:
+        due = self._store.due(job.now) or self._unread_incidents
+        marks = job.published or job.incidents or job.page_after is not None
+        if due or marks or job.batch or job.command or job.probe:
             self._send(job)
+
+    @property
+    def _unread_incidents(self) -> bool:
+        """True if stored events of incidents wait for publication and there is room for them."""
+        behind = self._store.last_incident_event > self._incidents_after
+        return behind and len(self._incidents) < OUTBOX_PAGE
 
     @property
     def takes_commands(self) -> bool:
@@ -347,6 +368,16 @@ class Committer:
         Raises StoreUnavailable if the database is known to be unavailable; no call is made then.
         """
         self._command(Command(wish, lambda _: None, lambda _: landed(), refused))
+
+    def store_and_read(
+        self,
+        wish: Wish,
+        read: Callable[[Store], T],
+        landed: Callable[[T], None],
+        refused: Callable[[StoreUnavailable], None],
+    ) -> None:
+        """Start storing as in `store`, and a read after the commit."""
+        self._command(Command(wish, read, landed, refused))
 
     def look(
         self,
@@ -366,10 +397,13 @@ class Committer:
         more = self._outbox_after is not None and len(self._unpublished) < OUTBOX_PAGE
         return WriteJob(
             next(self._keys),
+            self._wall(),
             self.waiting.take(),
             tuple(self._published),
             probe=self.problem is not None,
             page_after=self._outbox_after if more else None,
+            incidents=tuple(self._incidents_done),
+            incidents_after=self._incidents_after,
         )
 
     def _send(self, job: WriteJob) -> None:
@@ -389,13 +423,7 @@ class Committer:
             self._unknown = job
         else:
             self.waiting.give_back(job.batch)
-        if done.marked:
-            for _ in job.published:
-                self._published.popleft()
-        if done.page is not None:
-            self._unpublished.extend((event.seq, event.alarm) for event in done.page)
-            full = len(done.page) == OUTBOX_PAGE
-            self._outbox_after = done.page[-1].seq if full else None
+        self._note_publication(job, done)
         if done.error is not None:
             self._refused(done.error)
         elif self.problem is not None:
@@ -405,6 +433,24 @@ class Committer:
         self._publish_waiting()
         if job.command is not None:
             self._answer(job.command, done)
+
+    def _note_publication(self, job: WriteJob, done: WriteResult) -> None:
+        """Drop the marked events, and queue those that were read for publication."""
+        if done.marked:
+            for _ in job.published:
+                self._published.popleft()
+        if done.incidents_marked:
+            for _ in job.incidents:
+                self._incidents_done.popleft()
+        if done.incidents_after is not None:
+            self._incidents.extend(done.incidents)
+            if done.incidents:
+                self._stored()
+            self._incidents_after = done.incidents_after
+        if done.page is not None:
+            self._unpublished.extend((event.seq, event.alarm) for event in done.page)
+            full = len(done.page) == OUTBOX_PAGE
+            self._outbox_after = done.page[-1].seq if full else None
 
     def _answer(self, command: Command, done: WriteResult) -> None:
         """Pass a command its result. Stored data stay stored, whatever failed afterwards."""
@@ -474,6 +520,17 @@ class Committer:
                 if not self.publisher.event(alarm_key(alarm), payload, last=not alarm.active, done=done):
                     return
             self._unpublished.popleft()
+        while self._incidents:
+            event = self._incidents[0]
+            done = partial(self._incidents_done.append, event.seq)
+            if self.publisher is None:
+                done()
+            else:
+                payload = msgspec.json.encode(event_json(event))
+                key, last = incident_key(event.incident), not event.incident.open
+                if not self.publisher.event(key, payload, last=last, done=done):
+                    return
+            self._incidents.popleft()
 
 
 def _write(store: Store, job: WriteJob) -> WriteResult:
@@ -491,6 +548,8 @@ def _write(store: Store, job: WriteJob) -> WriteResult:
             happened=(*batch.happened, *wish.happened),
             without=wish.without,
             put=wish.put,
+            actions=wish.actions,
+            now=job.now,
             key=job.key,
         )
         done = WriteResult(numbers)
@@ -498,6 +557,13 @@ def _write(store: Store, job: WriteJob) -> WriteResult:
             done = replace(done, found=job.command.read(store))
         store.outbox_done(job.published)
         done = replace(done, marked=True)
+        store.incidents_published(job.incidents)
+        done = replace(done, incidents_marked=True)
+        if store.last_incident_event > job.incidents_after:
+            newest = store.last_incident_event
+            events = store.incidents_unpublished(after=job.incidents_after, limit=OUTBOX_PAGE)
+            read = events[-1].seq if len(events) == OUTBOX_PAGE else newest
+            done = replace(done, incidents=tuple(events), incidents_after=read)
         if job.page_after is not None:
             page = store.outbox_pending(OUTBOX_PAGE, after=job.page_after)
             done = replace(done, page=tuple(page))
@@ -507,6 +573,11 @@ def _write(store: Store, job: WriteJob) -> WriteResult:
         _log.exception("storing failed")
         return replace(done, error=StoreUnavailable(f"{type(error).__name__}: {error}", code="defect"))
     return done
+
+
+def incident_key(incident: Incident) -> str:
+    """Return the zenoh key of an incident, without the prefix."""
+    return f"{incident.feeder}/incident/{incident.id}"
 
 
 def alarm_key(alarm: Alarm) -> str:

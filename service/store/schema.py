@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -12,7 +13,7 @@ import sqlalchemy as sa
 from pydantic import Field
 
 from gridsec.errors import GridsecError
-from service.alarms.state_machine import Alarm, Change
+from service.alarms.state_machine import Alarm, Change, from_json
 
 
 class CommissioningChange(StrEnum):
@@ -91,7 +92,11 @@ ALARM = sa.Table(
     sa.Column("t_raised", sa.Double, nullable=False),
     sa.Column("t_cleared", sa.Double),
     sa.Column("data", sa.Text, nullable=False),
+    sa.Column("incident", sa.String(26)),  # null only for alarms that cleared before schema version 6
+    sa.Column("work", sa.String(26)),  # planned work during which it was raised
+    sa.Column("words", sa.Text, nullable=False, server_default=""),  # text for searches, in lower case
     sa.Index("alarm_by_feeder", "feeder", "state"),
+    sa.Index("alarm_by_incident", "incident"),
 )
 EVENT = sa.Table(
     "event",
@@ -111,6 +116,55 @@ OUTBOX = sa.Table(
     META,
     sa.Column("seq", SEQ, sa.ForeignKey("event.seq"), primary_key=True, autoincrement=False),
 )
+INCIDENT = sa.Table(
+    "incident",
+    META,
+    sa.Column("id", sa.String(26), primary_key=True),
+    sa.Column("kind", sa.String(32), nullable=False),
+    sa.Column("feeder", sa.String(64), nullable=False),
+    sa.Column("severity", sa.String(16), nullable=False),
+    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("t_first", sa.Double, nullable=False),
+    sa.Column("t_last", sa.Double, nullable=False),
+    sa.Column("t_cleared", sa.Double),
+    sa.Column("shelved_until", sa.Double),
+    sa.Column("planned_until", sa.Double),
+    sa.Column("assigned_to", sa.Text),
+    sa.Column("words", sa.Text, nullable=False),
+    sa.Column("data", sa.Text, nullable=False),
+    sa.Index("incident_by_feeder", "feeder", "state"),
+)
+INCIDENT_EVENT = sa.Table(
+    "incident_event",
+    META,
+    sa.Column("seq", SEQ, primary_key=True, autoincrement=True),
+    sa.Column("incident_id", sa.String(26), sa.ForeignKey("incident.id"), nullable=False, index=True),
+    sa.Column("feeder", sa.String(64), nullable=False),
+    sa.Column("t", sa.Double, nullable=False),
+    sa.Column("change", sa.String(16), nullable=False),
+    sa.Column("who", sa.Text),
+    sa.Column("comment", sa.Text),
+    sa.Column("notify", sa.Boolean, nullable=False),
+    sa.Column("data", sa.Text, nullable=False),
+    sa.Column("published", sa.Boolean, nullable=False),  # on zenoh
+    sa.Index("incident_event_by_publication", "published", "seq"),
+    sqlite_autoincrement=True,
+)
+
+
+def _suppression(name: str) -> sa.Table:
+    """A table of shelves or of planned works."""
+    return sa.Table(
+        name,
+        META,
+        sa.Column("id", sa.String(26), primary_key=True),
+        sa.Column("feeder", sa.String(64), nullable=False),
+        sa.Column("t_next", sa.Double, index=True),  # next time at which it changes; null after its end
+        sa.Column("data", sa.Text, nullable=False),
+    )
+
+
+SHELF, WORK = _suppression("shelf"), _suppression("planned_work")
 LAYOUT = sa.Table(
     "history_layout",
     META,
@@ -206,6 +260,20 @@ def _add_distrust(connection: sa.Connection) -> None:
     DISTRUST.create(connection)
 
 
+def words_of(alarm: Alarm) -> str:
+    """Return the text of an alarm for searches."""
+    parts = (
+        alarm.feeder,
+        alarm.kind,
+        alarm.meter,
+        alarm.customer,
+        alarm.reason,
+        alarm.acknowledged_by,
+        alarm.comment,
+    )
+    return " ".join(part for part in parts if part).lower()
+
+
 def digest(meters: str) -> str:
     """Return the lookup key of a layout."""
     return hashlib.sha256(meters.encode()).hexdigest()
@@ -231,12 +299,24 @@ def _add_rollup(connection: sa.Connection) -> None:
     ROLLUP.create(connection)
 
 
+def _add_incidents(connection: sa.Connection) -> None:
+    for column in ("incident VARCHAR(26)", "work VARCHAR(26)", "words TEXT NOT NULL DEFAULT ''"):
+        connection.exec_driver_sql(f"ALTER TABLE alarm ADD COLUMN {column}")
+    connection.exec_driver_sql("CREATE INDEX alarm_by_incident ON alarm (incident)")
+    for table in (INCIDENT, INCIDENT_EVENT, SHELF, WORK):
+        table.create(connection)
+    for number, data in connection.execute(sa.select(ALARM.c.id, ALARM.c.data)).all():
+        words = words_of(from_json(json.loads(data)))
+        connection.execute(ALARM.update().where(ALARM.c.id == number).values(words=words))
+
+
 MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
     _add_commissioning,
     _add_distrust,
     _add_digest,
     _add_writer,
     _add_rollup,
+    _add_incidents,
 )
 """Step k migrates schema version k + 1 to k + 2. A new database starts at the newest version."""
 

@@ -19,6 +19,7 @@ from typing import Any
 import sqlalchemy as sa
 import structlog
 
+from service.alarms.incidents import Action, Shelf
 from service.alarms.state_machine import (
     Alarm,
     AlarmState,
@@ -29,7 +30,9 @@ from service.alarms.state_machine import (
     to_json,
 )
 from service.report.report import FeederReport
+from service.store import incidents
 from service.store.connect import Connections
+from service.store.incidents import IncidentReader, rank_of, sorted_by, words_in
 from service.store.schema import (
     ALARM,
     BAD,
@@ -39,6 +42,7 @@ from service.store.schema import (
     EVENT,
     FEEDER,
     HISTORY,
+    INCIDENT_EVENT,
     LAYOUT,
     OUTBOX,
     ROLLUP,
@@ -51,6 +55,7 @@ from service.store.schema import (
     WriterLost,
     digest,
     migrate,
+    words_of,
 )
 from service.store.series import (
     MAX_ROWS,
@@ -70,7 +75,7 @@ from service.store.series import (
 from service.store.state_codec import SnapshotKind, StateSnapshot
 
 
-class Reader:
+class Reader(IncidentReader):
     """Read access to a store. Its connections cannot write."""
 
     def __init__(self, connections: Connections) -> None:
@@ -96,24 +101,32 @@ class Reader:
         meter: str | None = None,
         since: float | None = None,
         until: float | None = None,
+        incident: str | None = None,
+        text: str | None = None,
+        shelved: bool | None = None,
+        sort: str = "onset",
         cursor: str | None = None,
         limit: int = 100,
     ) -> tuple[list[Alarm], str | None]:
-        """Return a page of alarms, those with the latest onset first.
+        """Return a page of alarms.
 
         state, kind, severity: permitted values; empty for all.
         feeder, among, meter: restrict to this feeder, to these feeders, and to this meter; None for all.
         since, until: restrict to alarms raised in [since, until), Unix s.
+        incident: restrict to alarms of this incident.
+        text: restrict to alarms with each of these words, whatever their case.
+        shelved: restrict to active alarms that are shelved, or to all others.
+        sort: `onset` (latest first), `severity` (highest first) or `raised` (latest raising first).
         cursor: end of the previous page; pages stay correct while alarms are added or change.
         limit: length of a page.
         Returns alarms, cursor: the cursor is None on the last page.
         """
         a = ALARM.c
-        query = sa.select(a.id, a.data).order_by(a.id.desc()).limit(limit + 1)
+        query = sa.select(a.id, a.data).where(*words_in(a.words, text))
         for column, allowed in ((a.state, state), (a.kind, kind), (a.severity, severity)):
             if allowed:
                 query = query.where(column.in_([str(value) for value in allowed]))
-        for column, wanted in ((a.feeder, feeder), (a.meter, meter)):
+        for column, wanted in ((a.feeder, feeder), (a.meter, meter), (a.incident, incident)):
             if wanted is not None:
                 query = query.where(column == wanted)
         if among is not None:
@@ -122,12 +135,16 @@ class Reader:
             query = query.where(a.t_raised >= since)
         if until is not None:
             query = query.where(a.t_raised < until)
-        if cursor is not None:
-            query = query.where(a.id < cursor)
+        if shelved is not None:
+            any_shelf = sa.or_(sa.false(), *(_shelved_by(shelf) for shelf in self.shelves(standing=True)))
+            now = sa.and_(a.state != str(AlarmState.CLEARED), any_shelf)
+            query = query.where(now if shelved else sa.not_(now))
+        keys = {"onset": None, "severity": rank_of(a.severity), "raised": a.t_raised}
+        query, key = sorted_by(query, a.id, keys[sort], cursor)
         with self._read() as connection:
-            rows = connection.execute(query).all()
+            rows = connection.execute(query.limit(limit + 1)).all()
         page = [from_json(json.loads(row.data)) for row in rows[:limit]]
-        return page, (page[-1].id if len(rows) > limit else None)
+        return page, (key(rows[limit - 1]) if len(rows) > limit else None)
 
     def raised(self, *, among: Collection[str] | None = None) -> int:
         """Number of active alarms without an acknowledgement, of some feeders or (None) of all."""
@@ -372,6 +389,16 @@ def _newest_rows(
     return [(t, verdict, data, meters[layout]) for t, verdict, data, layout in reversed(found)]
 
 
+def _shelved_by(shelf: Shelf) -> sa.ColumnElement[bool]:
+    """Condition that a shelf applies to an alarm."""
+    a = ALARM.c
+    given = ((a.id, shelf.alarm), (a.incident, shelf.incident), (a.meter, shelf.meter), (a.kind, shelf.kind))
+    return sa.and_(
+        a.feeder == shelf.feeder,
+        *(sa.and_(column.is_not(None), column == str(value)) for column, value in given if value is not None),
+    )
+
+
 def _event(row: sa.RowMapping) -> AlarmEvent:
     return AlarmEvent(
         row["seq"],
@@ -423,11 +450,19 @@ class Store(Reader):
             with self._connections.opening() as connection:
                 migrate(connection, self.name)
                 self._connections.own(connection)
+                standing = incidents.orphans(connection)
+                if standing:
+                    now = max(item.t for item in standing)
+                    found = incidents.prepare(connection, standing, (), now)
+                    incidents.store(connection, self._connections.insert, found)
                 newest = connection.scalar(sa.select(sa.func.max(EVENT.c.seq)))
+                newest_incident = connection.scalar(sa.select(sa.func.max(INCIDENT_EVENT.c.seq)))
+                self._due = incidents.next_due(connection)
         except BaseException:
             self._connections.close()
             raise
         self._last_event = int(newest or 0)
+        self._last_incident_event = int(newest_incident or 0)
         if (beat_s := self._connections.beat_s) is not None:
             threading.Thread(
                 target=self._beat, args=(beat_s,), name="gridsec-store-beat", daemon=True
@@ -473,6 +508,15 @@ class Store(Reader):
         """Number of the newest event; without a call to the database."""
         return self._last_event
 
+    @property
+    def last_incident_event(self) -> int:
+        """Number of the newest event of an incident; without a call to the database."""
+        return self._last_incident_event
+
+    def due(self, now: float) -> bool:
+        """True if a shelf or a planned work changes by `now`, Unix s; without a call to the database."""
+        return self._due is not None and self._due <= now
+
     @contextmanager
     def _alone(self) -> Iterator[None]:
         """Wait for the previous write, within a time limit."""
@@ -501,17 +545,21 @@ class Store(Reader):
         happened: Iterable[CommissioningEvent] = (),
         without: str | None = None,
         put: tuple[str, Mapping[str, Any]] | None = None,
+        actions: Iterable[Action] = (),
+        now: float | None = None,
         key: int | None = None,
     ) -> tuple[int, ...]:
         """Store the results of a tick in one transaction; durable when this returns.
 
-        transitions: changed alarms: state, event and outbox entry of each.
+        transitions: changed alarms: state, event and outbox entry of each, and changes of their incidents.
         reports: reports of the feeders; the history selects from them.
         rejected: rejected readings; the newest `BAD_READINGS_KEPT` are kept. Readings that the database
             cannot represent are dropped and logged.
         kept, happened: state of the feeders' commissioning and suspicions, and changes of the former.
         without: delete the tables of this feeder, its commissioning and its suspicions.
         put: a feeder and the columns of its files as JSON, which replace the stored ones.
+        actions: actions of operators on incidents, shelves and planned works.
+        now: wall clock, Unix s, for shelves and works; None: the latest time of the transitions.
         key: positive number of this commit, different from that of the previous commit. After
             `OutcomeUnknown` the same call with the same key stores it, or finds it stored.
         Returns tuple of int: the event number of each transition.
@@ -519,18 +567,24 @@ class Store(Reader):
             stored.
         """
         transitions, rejected = tuple(transitions), tuple(rejected)
-        kept, happened = tuple(kept), tuple(happened)
+        kept, happened, actions = tuple(kept), tuple(happened), tuple(actions)
+        if now is None:
+            now = max((item.t for item in transitions), default=-math.inf)
         with self._alone():
             marks, rolled = dict(self._marks), dict(self._rolled)
             worthy = [report for report in reports if self._worth(marks, report)]
-            if not (transitions or worthy or rejected or kept or happened or without or put):
+            grouped = bool(transitions or actions or self.due(now))
+            if not (grouped or worthy or rejected or kept or happened or without or put):
                 return ()
+            newest, following = self._last_incident_event, self._due
             with self._connections.write() as connection:
                 if key is not None and _stored_before(connection, key):
                     newer = sa.select(EVENT.c.seq).where(EVENT.c.seq > self._last_event)
                     numbers = tuple(connection.scalars(newer.order_by(EVENT.c.seq)))
                 else:
+                    grouping = incidents.prepare(connection, transitions, actions, now) if grouped else []
                     numbers = tuple(self._put_transition(connection, item) for item in transitions)
+                    incidents.store(connection, self._connections.insert, grouping)
                     for report in worthy:
                         self._put_history(connection, report)
                         _roll_up(connection, self._connections.insert, rolled, report)
@@ -544,7 +598,11 @@ class Store(Reader):
                         _forget_feeder(connection, without)
                     if put is not None:
                         self._put_feeder(connection, *put)
-            self._marks, self._rolled = marks, rolled
+                if grouped:
+                    newest = connection.scalar(sa.select(sa.func.max(INCIDENT_EVENT.c.seq))) or 0
+                    following = incidents.next_due(connection)
+            self._marks, self._rolled, self._due = marks, rolled, following
+            self._last_incident_event = newest
             self._last_event = max((self._last_event, *numbers))
             return numbers
 
@@ -554,6 +612,12 @@ class Store(Reader):
         if rows:
             with self._write() as connection:
                 connection.execute(OUTBOX.delete().where(OUTBOX.c.seq == sa.bindparam("number")), rows)
+
+    def incidents_published(self, numbers: Sequence[int]) -> None:
+        """Mark events of incidents as published on zenoh."""
+        if numbers:
+            with self._write() as connection:
+                incidents.published(connection, numbers)
 
     def check(self) -> None:
         """Test a write. Raises StoreUnavailable if the database cannot be written."""
@@ -572,6 +636,7 @@ class Store(Reader):
             "state": str(alarm.state),
             "t_raised": alarm.t_raised,
             "t_cleared": alarm.t_cleared,
+            "words": words_of(alarm),
             "data": data,
         }
         connection.execute(

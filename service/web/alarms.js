@@ -12,6 +12,7 @@ const KIND = {
   undecided: "Undecided",
   "learning-stalled": "Learning stalled",
   "clock-offset": "Clock offset",
+  "identity-mismatch": "Identity mismatch",
 };
 const LISTED = 5; // Largest number of meters in the text of an alarm.
 const PAGE = 50;
@@ -31,7 +32,7 @@ function hint({ data_error: error }) {
 }
 
 export class Alarms {
-  constructor({ onPick, onLink, onSeries }) {
+  constructor({ onPick, onLink, onSeries, onChange = () => {} }) {
     this.alarms = new Map();
     this.items = new Map();
     this.loading = 0;
@@ -42,6 +43,7 @@ export class Alarms {
     this.onPick = onPick;
     this.onLink = onLink;
     this.onSeries = onSeries; // Called with an alarm of a meter.
+    this.onChange = onChange; // Called after each change of an alarm.
     this.feeder = null;
     this.source = null;
     this.retry = null;
@@ -158,6 +160,7 @@ export class Alarms {
 
   take(event) {
     const { alarm } = event;
+    this.onChange();
     if (this.loading > 0) this.heard.set(alarm.id, event);
     this.put(alarm);
     this.render();
@@ -255,6 +258,7 @@ export class Alarms {
       const body = await response.json();
       if (!response.ok) throw new Error(body.detail);
       this.put(body);
+      this.onChange();
       this.render();
       byId("ack").close();
     } catch (error) {

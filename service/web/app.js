@@ -2,6 +2,7 @@
 
 import { Alarms } from "./alarms.js";
 import { Banner, offline } from "./banner.js";
+import { Incidents } from "./incidents.js";
 import { Commissioning } from "./commissioning.js";
 import { showDetail } from "./detail.js";
 import { Diagram } from "./diagram.js";
@@ -15,20 +16,23 @@ const KEPT = 600;
 
 const page = { feeder: null, report: null, refused: null, selected: null, source: null, retry: null, heard: null, word: "…", others: 0, linked: true, alarmsLinked: true, past: new Map(), turn: 0 };
 const diagram = new Diagram({ onSelect: (id) => select(id === page.selected ? null : id) });
+const pick = async (feeder, meter, owner) => {
+  if (feeder !== page.feeder?.name) await show(feeder);
+  if (feeder !== page.feeder?.name) return;
+  const customer = page.feeder?.layout.customers.find((c) => (owner ? c.customer === owner : c.meter === meter));
+  if (customer) select(customer.customer);
+};
 const alarms = new Alarms({
-  onPick: async (feeder, meter, owner) => {
-    if (feeder !== page.feeder?.name) await show(feeder);
-    if (feeder !== page.feeder?.name) return;
-    const customer = page.feeder?.layout.customers.find((c) => (owner ? c.customer === owner : c.meter === meter));
-    if (customer) select(customer.customer);
-  },
+  onPick: pick,
   onLink: (up) => { page.alarmsLinked = up; },
   onSeries: async (alarm) => {
     if (alarm.feeder !== page.feeder?.name) await show(alarm.feeder);
     if (alarm.feeder !== page.feeder?.name) return;
     series.open([alarm.meter], around(alarm));
   },
+  onChange: () => incidents.later(),
 });
+const incidents = new Incidents({ alarms, onPick: pick });
 
 const fleet = new Fleet({ onPick: (name) => show(name), onChange: (attacked) => { page.others = attacked; title(); } });
 const series = new Series({ onChange: () => address() });
@@ -108,6 +112,7 @@ async function show(name, query = new URLSearchParams()) {
   diagram.show(page.feeder);
   verdict();
   alarms.watch(name);
+  incidents.watch(name);
   commissioning.watch(name);
   listen(name);
 }
@@ -124,6 +129,7 @@ function refused(name, why) {
   verdict();
   fresh();
   alarms.watch(name);
+  incidents.watch(name);
   commissioning.watch(null);
 }
 

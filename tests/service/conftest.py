@@ -10,9 +10,11 @@ import tempfile
 import threading
 import time
 from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
+from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -28,14 +30,17 @@ from service.alarms.state_machine import (
     AlarmRules,
     AlarmUnknown,
     advance,
+    carry,
     conditions,
 )
 from service.api.routes import create_api
 from service.engine.commissioning import CommissioningProgress
+from service.engine.operators import SHELVE_MOST_S, Operators
 from service.errors import FeederFixed, FeederUnknown, TooManyFeeders
 from service.report.feeder_info import revision
 from service.report.report import BusState, FeederReport, MeterState, Silence
 from service.store import Store
+from service.store.committer import Wish
 from service.store.schema import CommissioningChange, CommissioningEvent
 from tests.service.asking import T0, Setup
 from tests.service.databases import Cluster, find_postgresql
@@ -142,6 +147,40 @@ class Village:
         )
 
 
+class InlineCommitter:
+    """Writes and reads at once."""
+
+    def __init__(self, service: SmallService) -> None:
+        self.service = service
+
+    def look(self, read: Callable[[Store], Any], landed: Callable[[Any], None], _: object) -> None:
+        landed(read(self.service.store))
+
+    def store(self, wish: Wish, landed: Callable[[], None], refused: object) -> None:
+        self.store_and_read(wish, lambda _: None, lambda _: landed(), refused)
+
+    def store_and_read(
+        self, wish: Wish, read: Callable[[Store], Any], landed: Callable[[Any], None], _: object
+    ) -> None:
+        service = self.service
+        service.store.commit(wish.transitions, actions=wish.actions, now=service.wall())
+        landed(read(service.store))
+
+
+class InlineEngine:
+    """The part of an engine that actions of operators use."""
+
+    def __init__(self, service: SmallService) -> None:
+        self.service, self.store, self.committer = service, service.store, InlineCommitter(service)
+
+    @property
+    def monitors(self) -> dict[str, Any]:
+        return {name: SimpleNamespace(book=book) for name, book in self.service.books.items()}
+
+    def carry_over(self, alarm: Alarm) -> None:
+        self.service.books[alarm.feeder] = carry(self.service.books[alarm.feeder], alarm) or AlarmBook("")
+
+
 class SmallService:
     """A backend of the HTTP application: real alarms, real store, reports from the test."""
 
@@ -163,6 +202,11 @@ class SmallService:
         self.loop: asyncio.AbstractEventLoop | None = None
         self.queues: set[asyncio.Queue[dict[str, Any] | None]] = set()
         self.lock = threading.Lock()
+        self.wall: Callable[[], float] = time.time
+        self.operators = Operators(InlineEngine(self), self._now, SHELVE_MOST_S)  # type: ignore[arg-type]
+
+    def _now(self) -> float:
+        return self.wall()
 
     def tick(self, report: FeederReport) -> None:
         report = replace(report, revision=self.villages[report.feeder].detail()["revision"])
@@ -286,6 +330,19 @@ class SmallService:
                 self.wake({"type": "alarm", "data": None})
                 return transition.alarm
         raise AlarmUnknown(alarm_id)
+
+    @property
+    def shelve_most_s(self) -> float:
+        return self.operators.shelve_most_s
+
+    async def operate(self, action: Callable[[Operators], Future[Any]]) -> Any:
+        def run() -> Any:
+            with self.lock:
+                return action(self.operators).result(timeout=5)
+
+        found = await asyncio.to_thread(run)
+        self.wake({"type": "alarm", "data": None})
+        return found
 
     async def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:
         queue: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue(8)

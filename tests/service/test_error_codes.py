@@ -50,6 +50,8 @@ from service.ingest import zenoh_bus
 from service.ingest.align import AlignRules
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import MeterClient
+from service.notify.post import permitted
+from service.notify.targets import read_targets
 from service.settings import refuse_exposed, settings
 from service.store import Store, backup, committer, schema
 from service.store.access import AccessStore
@@ -327,6 +329,19 @@ def put_fails(_: Path, __: Patch) -> None:
     meters.put("key", b"")
 
 
+def wrong_targets(place: Path, _: Patch) -> None:
+    path = place / "targets.toml"
+    hook = '[[webhook]]\nname = "a"\nurl = '
+    path.write_text(f'{hook}"http://a.example"\n{hook}"https://a.example"\nsecret = "whsec_AA"\n')
+    problems = []
+    for text in ("[", path.read_text()):
+        path.write_text(text)
+        with pytest.raises(InputInvalid) as caught:
+            read_targets(path)
+        problems += caught.value.problems
+    raise InputInvalid(problems)
+
+
 def no_bus(_: Path, patch: Patch) -> None:
     def refuse(_: object) -> None:
         raise zenoh.ZError("no listener at /there")
@@ -524,6 +539,8 @@ CALLS: dict[str, Call] = {
     "settings": wrong_settings,
     "damaged certificate": damaged_certificate,
     "keys of meters": wrong_meter_keys,
+    "targets of notifications": wrong_targets,
+    "target at a private address": lambda _, __: permitted("127.0.0.1", 443, private=False),
     "zenoh on a network without TLS": lambda _, __: refuse_exposed(("tcp/0.0.0.0:7447", "tls/0.0.0.0:7448")),
     "zenoh file that is damaged": lambda place, _: (
         (place / "zenoh.json5").write_text("{ mode: "),

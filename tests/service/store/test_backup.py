@@ -21,7 +21,8 @@ from service.cli.simulate import Pace, play
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import MeterClient
 from service.store import Store, StoreUnavailable
-from service.store.backup import backup, restore
+from service.store.backup import NEWEST, backup, restore
+from service.store.deliveries import DeliveryStore, Position
 from tests.service.databases import Cluster, both
 from tests.service.running import FEEDER, free_port, until
 from tests.service.stored import T0, a_report, an_alarm, raised
@@ -77,7 +78,7 @@ def test_alarms_survive_kill_9_and_restore(tmp_path: Path) -> None:
             history = httpx.get(f"{url}/api/v1/feeders/{FEEDER}/history").json()["points"]
             done = gridsec("backup", str(file), "--database", database)
             assert (done.returncode, done.stderr) == (0, "")
-            assert done.stdout == f"{file}: {file.stat().st_size} bytes, schema version 6\n"
+            assert done.stdout == f"{file}: {file.stat().st_size} bytes, schema version {NEWEST}\n"
             refused = gridsec("restore", str(file), "--database", database)
             assert refused.returncode == 4
             assert "another process writes it; stop the service first" in refused.stderr
@@ -143,6 +144,17 @@ def test_keys_and_audit_log_go_along(tmp_path: Path) -> None:
     Path(f"{database}.access").unlink()
     backup(f"sqlite:///{database}", file)
     assert not Path(f"{file}.access").exists()
+
+
+def test_positions_of_notifications_go_along(tmp_path: Path) -> None:
+    database, file = f"sqlite:///{tmp_path}/g.db", tmp_path / "backup"
+    Store(database).close()
+    with DeliveryStore(database) as store:
+        store.keep("hook", Position(7))
+    assert [copy.name for copy in backup(database, file)] == [str(file), f"{file}.notify"]
+    restore(f"sqlite:///{tmp_path}/new.db", file)
+    with DeliveryStore(f"sqlite:///{tmp_path}/new.db") as store:
+        assert store.positions() == {"hook": Position(7)}
 
 
 def test_what_is_no_backup_is_refused(tmp_path: Path) -> None:

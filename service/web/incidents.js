@@ -1,0 +1,358 @@
+// Incident list: one line per incident, expandable to its alarms and its log; actions of operators; hand-over.
+
+import { byId, clock, duration, el, getJson, isKnown, settle } from "./dom.js";
+import { session } from "./session.js";
+
+const API = "/api/v1";
+const KIND = {
+  manipulation: "Manipulation",
+  "data-loss": "Data loss",
+  "voltage-limit": "Voltage limit",
+  undecided: "Undecided",
+  "clock-offset": "Clock offset",
+  "identity-mismatch": "Identity mismatch",
+  "learning-stalled": "Learning stalled",
+};
+const CHANGE = {
+  opened: "opened", extended: "further alarms", escalated: "higher severity", reopened: "opened again",
+  updated: "alarms changed", cleared: "cleared", acknowledged: "acknowledged", unacknowledged: "acknowledgement withdrawn",
+  assigned: "assigned", commented: "comment", shelved: "shelved", unshelved: "shelf ended",
+  "work-begun": "planned work begun", "work-ended": "planned work ended",
+};
+const ACTIONS = {
+  ack: { title: "Acknowledge incident", verb: "Acknowledge", key: "a", text: "Comment", path: "ack" },
+  unack: { title: "Withdraw acknowledgement", verb: "Withdraw", key: "u", text: "Comment", path: "unack" },
+  comment: { title: "Comment", verb: "Add comment", key: "c", text: "Comment", needed: true, path: "comment" },
+  assign: { title: "Assign incident", verb: "Assign", key: "g", text: "Comment", path: "assign", to: true },
+  shelve: { title: "Shelve incident", verb: "Shelve", key: "s", text: "Reason", needed: true, duration: true },
+  work: { title: "Planned work", verb: "Enter", text: "Reason", needed: true, times: true },
+};
+const HOURS = [1, 4, 8, 24, 72, 168];
+const PAGE = 50;
+const ALARMS_SHOWN = 100;
+const EVERY_MS = 5000;
+const SOON_MS = 200;
+
+const plural = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
+const local = (t) => {
+  const date = new Date(t * 1000);
+  return new Date(date - date.getTimezoneOffset() * 60000).toISOString().slice(0, 16);
+};
+
+// Devices of an incident: one by name, several by number.
+function subject({ meters, customers }) {
+  if (meters.length > 1) return plural(meters.length, "meter");
+  if (meters.length === 1) return meters[0];
+  if (customers.length) return customers.length === 1 ? customers[0] : plural(customers.length, "inverter");
+  return null;
+}
+
+export class Incidents {
+  constructor({ alarms, onPick }) {
+    this.alarms = alarms;
+    this.onPick = onPick;
+    this.found = [];
+    this.items = new Map();
+    this.open = new Map(); // Alarms and events of expanded incidents.
+    this.feeder = null;
+    this.limit = PAGE;
+    this.turn = 0;
+    this.soon = null;
+    this.most = 86400;
+    this.asking = null;
+    for (const id of ["incident-state", "incident-kind", "incident-severity", "incident-scope", "incident-sort"]) byId(id).addEventListener("change", () => this.reload());
+    byId("incident-text").addEventListener("input", () => this.later());
+    byId("incident-more").addEventListener("click", () => { this.limit += PAGE; this.reload(); });
+    byId("incident-list").addEventListener("keydown", (event) => this.key(event));
+    byId("act-form").addEventListener("submit", (event) => this.send(event));
+    byId("act-cancel").addEventListener("click", () => byId("act").close());
+    byId("shift-open").addEventListener("click", () => this.shift());
+    byId("shift-close").addEventListener("click", () => byId("shift").close());
+    byId("shift-since").addEventListener("change", () => this.shift());
+    byId("work-open").addEventListener("click", () => this.ask("work"));
+    setInterval(() => this.reload(), EVERY_MS);
+  }
+
+  watch(feeder) {
+    this.feeder = feeder;
+    this.reload();
+  }
+
+  // An alarm has changed: several events cause one request.
+  later() {
+    this.soon ??= setTimeout(() => { this.soon = null; this.reload(); }, SOON_MS);
+  }
+
+  query() {
+    const query = new URLSearchParams({ limit: this.limit, sort: byId("incident-sort").value });
+    const state = byId("incident-state").value;
+    for (const value of { open: ["raised", "acknowledged"], todo: ["raised"], all: [] }[state]) query.append("state", value);
+    if (state === "todo") for (const name of ["shelved", "planned"]) query.set(name, "false");
+    for (const name of ["kind", "severity"]) if (byId(`incident-${name}`).value) query.set(name, byId(`incident-${name}`).value);
+    if (byId("incident-scope").value === "this" && this.feeder) query.set("feeder", this.feeder);
+    const text = byId("incident-text").value.trim();
+    if (text) query.set("text", text);
+    return query;
+  }
+
+  async reload() {
+    if (!this.feeder) return;
+    this.turn += 1;
+    const { turn } = this;
+    try {
+      const page = await getJson(`${API}/incidents?${this.query()}`);
+      if (turn !== this.turn) return; // The response belongs to an earlier choice.
+      byId("incident-error").hidden = true;
+      byId("incident-count").hidden = page.raised === 0;
+      byId("incident-count").textContent = `${page.raised} new`;
+      byId("incident-more").hidden = page.next === null;
+      await this.list(page.incidents);
+    } catch (error) {
+      if (turn !== this.turn) return;
+      byId("incident-error").textContent = `Incidents not loaded: ${error.message}`;
+      byId("incident-error").hidden = false;
+    }
+  }
+
+  async list(found) {
+    const before = new Map(this.found.map((one) => [one.id, JSON.stringify(one)]));
+    this.found = found;
+    await Promise.all(found.filter((one) => this.open.has(one.id) && before.get(one.id) !== JSON.stringify(one)).map((one) => this.details(one.id)));
+    this.render();
+  }
+
+  async details(id) {
+    const [{ alarms, next }, { events }] = await Promise.all([
+      getJson(`${API}/alarms?${new URLSearchParams({ incident: id, limit: ALARMS_SHOWN, sort: "severity" })}`),
+      getJson(`${API}/incidents/${id}/events?limit=1000`),
+    ]);
+    if (this.open.has(id)) this.open.set(id, { alarms, more: next !== null, events });
+  }
+
+  async toggle(id) {
+    if (this.open.has(id)) {
+      this.open.delete(id);
+    } else {
+      this.open.set(id, null);
+      await this.details(id).catch((error) => this.open.set(id, { problem: error.message }));
+    }
+    this.render();
+  }
+
+  render() {
+    byId("incident-none").hidden = this.found.length > 0 || !byId("incident-error").hidden;
+    const focused = document.activeElement?.closest?.("[data-incident]");
+    const [own, act] = [focused?.dataset.incident, document.activeElement?.dataset?.act];
+    // Unchanged items keep their nodes: a click must not fall between two copies of a button.
+    const before = this.items;
+    this.items = new Map(this.found.map((incident) => {
+      const said = JSON.stringify([incident, this.open.get(incident.id)]);
+      const old = before.get(incident.id);
+      return [incident.id, old?.said === said ? old : { said, node: this.item(incident) }];
+    }));
+    settle(byId("incident-list"), [...this.items.values()].map(({ node }) => node));
+    if (own && !byId("incident-list").contains(document.activeElement)) {
+      const item = byId("incident-list").querySelector(`[data-incident="${CSS.escape(own)}"]`);
+      (item?.querySelector(`[data-act="${CSS.escape(act ?? "")}"]`) ?? item?.querySelector(".line"))?.focus();
+    }
+  }
+
+  item(incident) {
+    const shown = this.open.has(incident.id);
+    const about = subject(incident);
+    const place = incident.feeder + (about ? ` · ${about}` : "");
+    const numbers = incident.state === "cleared"
+      ? `cleared after ${duration(incident.t_cleared - incident.t_first)}`
+      : `${plural(incident.active, "alarm")}${incident.unacknowledged ? `, ${incident.unacknowledged} new` : ""}`;
+    const note = (text, kind) => (text ? el("span", { class: "note", "data-kind": kind, text }) : null);
+    const line = el("button", { type: "button", class: "line", "aria-expanded": String(shown), "aria-keyshortcuts": "a u c g s", "data-act": "line", on: { click: () => this.toggle(incident.id) } },
+      el("span", { class: "grade", text: incident.severity }),
+      el("b", { text: KIND[incident.kind] ?? incident.kind }),
+      el("span", { class: "place", text: place }),
+      el("span", { class: "numbers", text: numbers }),
+      el("span", { class: "quiet", text: `since ${clock(incident.t_first)}` }),
+      note(isKnown(incident.shelved_until) && incident.state !== "cleared" ? `shelved until ${clock(incident.shelved_until)}` : "", "shelved"),
+      note(isKnown(incident.planned_until) && incident.state !== "cleared" ? `planned work until ${clock(incident.planned_until)}` : "", "work"),
+      note(incident.state === "acknowledged" ? `acknowledged${incident.acknowledged_by ? ` by ${incident.acknowledged_by}` : ""}` : "", "ack"),
+      note(incident.assigned_to ? `→ ${incident.assigned_to}` : "", "assigned"));
+    const suppressed = isKnown(incident.shelved_until) || isKnown(incident.planned_until);
+    return el("li", { class: "incident", "data-incident": incident.id, "data-severity": incident.severity, "data-state": incident.state, "data-suppressed": suppressed ? "yes" : "no" },
+      line, shown ? this.body(incident) : null);
+  }
+
+  body(incident) {
+    const found = this.open.get(incident.id);
+    const button = (name, text) => el("button", { type: "button", "data-act": name, title: `Key ${ACTIONS[name].key}`, text, on: { click: () => this.ask(name, incident) } });
+    const open = incident.state !== "cleared";
+    const buttons = el("div", { class: "tools" },
+      open && incident.unacknowledged ? button("ack", "Acknowledge all") : null,
+      open && incident.active > incident.unacknowledged ? button("unack", "Withdraw") : null,
+      button("comment", "Comment"), button("assign", "Assign"),
+      open ? button("shelve", "Shelve") : null);
+    const events = (found?.events ?? []).filter((event) => event.change !== "updated");
+    return el("div", { class: "body" },
+      el("p", { class: "reason", text: incident.reason }),
+      el("p", {}, el("a", { href: `#${encodeURIComponent(incident.feeder)}`, class: "where", text: `Show ${incident.feeder}`, on: { click: (event) => {
+        event.preventDefault();
+        this.onPick(incident.feeder, incident.meters[0] ?? null, incident.customers[0] ?? null);
+      } } })),
+      buttons,
+      found?.problem ? el("p", { class: "error", text: `Not loaded: ${found.problem}` }) : null,
+      el("ol", { class: "alarm-list", "aria-label": "Alarms of the incident" }, ...(found?.alarms ?? []).map((alarm) => this.alarms.item(alarm))),
+      found?.more ? el("p", { class: "quiet", text: `${incident.alarms - ALARMS_SHOWN} more alarms` }) : null,
+      events.length ? el("ol", { class: "log", "aria-label": "Log of the incident" }, ...events.map((event) => this.logged(event))) : null);
+  }
+
+  logged({ t, change, who, comment, incident }) {
+    const to = change === "assigned" ? ` to ${incident.assigned_to ?? "none"}` : "";
+    return el("li", {}, el("time", { text: clock(t) }), ` ${CHANGE[change] ?? change}${to}${who ? ` by ${who}` : ""}`, comment ? el("q", { text: comment }) : null);
+  }
+
+  // Arrow keys go from incident to incident, letters act on the focused one.
+  key(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const own = event.target.closest("[data-incident]");
+    const lines = [...byId("incident-list").querySelectorAll(".line")];
+    const place = lines.findIndex((line) => own?.contains(line));
+    if (event.key === "ArrowDown" || event.key === "ArrowUp") {
+      lines[place + (event.key === "ArrowDown" ? 1 : -1)]?.focus();
+      event.preventDefault();
+      return;
+    }
+    const incident = this.found.find((one) => one.id === own?.dataset.incident);
+    const name = Object.keys(ACTIONS).find((each) => ACTIONS[each].key === event.key.toLowerCase());
+    if (!incident || !name || (incident.state === "cleared" && !["comment", "assign"].includes(name))) return;
+    if (name === "ack" && !incident.unacknowledged) return;
+    if (name === "unack" && incident.active === incident.unacknowledged) return;
+    event.preventDefault();
+    this.ask(name, incident);
+  }
+
+  // ---------------------------------------------------------------- actions
+
+  async ask(name, incident = null) {
+    const action = ACTIONS[name];
+    this.asking = { name, incident };
+    byId("act-title").textContent = action.title;
+    const about = incident && subject(incident);
+    byId("act-what").textContent = incident
+      ? `${KIND[incident.kind] ?? incident.kind}: ${incident.feeder}${about ? ` · ${about}` : ""}, ${plural(incident.active, "active alarm")}.`
+      : `Alarms of ${this.feeder} are recorded, marked, and do not notify.`;
+    byId("act-send").textContent = action.verb;
+    byId("act-text-name").textContent = action.text;
+    byId("act-text").value = "";
+    byId("act-text").required = Boolean(action.needed);
+    byId("act-to-row").hidden = !action.to;
+    byId("act-to").value = incident?.assigned_to ?? "";
+    byId("act-duration-row").hidden = !action.duration;
+    byId("act-times").hidden = !action.times;
+    for (const id of ["act-from", "act-until"]) byId(id).required = Boolean(action.times);
+    const now = Date.now() / 1000;
+    byId("act-from").value = local(now);
+    byId("act-until").value = local(now + 7200);
+    byId("act-error").hidden = true;
+    session.ask("act-who");
+    if (action.duration) await this.durations();
+    byId("act").showModal();
+  }
+
+  async durations() {
+    const { max_duration_s: most } = await getJson(`${API}/shelves`).catch(() => ({ max_duration_s: this.most }));
+    this.most = most;
+    const hours = HOURS.filter((each) => each * 3600 <= most);
+    const options = hours.length ? hours.map((each) => [each * 3600, plural(each, "hour")]) : [[most, duration(most)]];
+    byId("act-duration").replaceChildren(...options.map(([value, text]) => el("option", { value, text })));
+  }
+
+  request() {
+    const { name, incident } = this.asking;
+    const text = byId("act-text").value;
+    if (name === "shelve") return [`${API}/shelves`, { incident: incident.id, duration_s: Number(byId("act-duration").value), reason: text }];
+    if (name === "work") {
+      const [from, until] = ["act-from", "act-until"].map((id) => new Date(byId(id).value).getTime() / 1000);
+      return [`${API}/planned-work`, { feeder: this.feeder, t_from: from, t_until: until, reason: text }];
+    }
+    const more = { ack: { count: incident.count }, assign: { to: byId("act-to").value.trim() || null } }[name];
+    return [`${API}/incidents/${incident.id}/${ACTIONS[name].path}`, { comment: text, ...more }];
+  }
+
+  async send(event) {
+    event.preventDefault();
+    try {
+      if (!session.complete("act-who")) throw new Error("please enter your name");
+      const [url, body] = this.request();
+      await post(url, { ...session.operator("act-who"), ...body });
+      byId("act").close();
+      this.reload();
+      if (byId("shift").open) this.shift();
+    } catch (error) {
+      byId("act-error").textContent = `Not done: ${error.message}`;
+      byId("act-error").hidden = false;
+    }
+  }
+
+  // -------------------------------------------------------------- hand-over
+
+  async shift() {
+    const since = Date.now() / 1000 - Number(byId("shift-since").value) * 3600;
+    byId("shift-error").hidden = true;
+    try {
+      const found = await getJson(`${API}/hand-over?since=${since}`);
+      const rows = (id, list, row) => byId(id).replaceChildren(...(list.length ? list.map(row) : [el("li", { class: "quiet", text: "None." })]));
+      byId("shift-time").textContent = `at ${clock(found.t, { day: true })}`;
+      rows("shift-incidents", found.incidents, (one) => this.summary(one));
+      rows("shift-shelves", found.shelves, (one) => el("li", {},
+        el("span", {}, el("b", { text: shelved(one) }), ` until ${clock(one.until, { day: true })}, ${one.who}: `, el("q", { text: one.reason })),
+        this.ending(`${API}/shelves/${one.id}/end`)));
+      rows("shift-works", found.planned_work, (one) => el("li", {},
+        el("span", {}, el("b", { text: one.feeder }), ` ${clock(one.t_from, { day: true })} to ${clock(one.t_until, { day: true })}, ${one.who}: `, el("q", { text: one.reason })),
+        this.ending(`${API}/planned-work/${one.id}/end`)));
+      rows("shift-comments", found.comments, (one) => el("li", {},
+        el("span", {}, el("time", { text: clock(one.t, { day: true }) }), ` ${one.feeder}, ${one.who}, ${CHANGE[one.change] ?? one.change}: `, el("q", { text: one.comment }))));
+    } catch (error) {
+      byId("shift-error").textContent = `Not loaded: ${error.message}`;
+      byId("shift-error").hidden = false;
+    }
+    if (!byId("shift").open) byId("shift").showModal();
+  }
+
+  summary(one) {
+    const about = subject(one);
+    const notes = [
+      one.unacknowledged ? `${one.unacknowledged} new` : "acknowledged",
+      isKnown(one.shelved_until) ? `shelved until ${clock(one.shelved_until)}` : null,
+      isKnown(one.planned_until) ? `planned work until ${clock(one.planned_until)}` : null,
+      one.assigned_to ? `assigned to ${one.assigned_to}` : null,
+    ].filter(Boolean).join(", ");
+    return el("li", { "data-severity": one.severity }, el("span", {},
+      el("b", { text: `${KIND[one.kind] ?? one.kind}, ${one.severity}` }),
+      ` ${one.feeder}${about ? ` · ${about}` : ""}, ${plural(one.active, "alarm")}, ${notes}, since ${clock(one.t_first, { day: true })}`));
+  }
+
+  ending(url) {
+    return el("button", { type: "button", class: "plain", text: "End", on: { click: async () => {
+      try {
+        const name = localStorage.getItem("gridsec.who") ?? "";
+        await post(url, session.name === null ? { "who": name } : {});
+        await this.shift();
+        this.reload();
+      } catch (error) {
+        byId("shift-error").textContent = `Not ended: ${error.message}`;
+        byId("shift-error").hidden = false;
+      }
+    } } });
+  }
+}
+
+// Alarms of a shelf.
+function shelved(one) {
+  const what = one.alarm ? "one alarm" : one.incident ? "one incident" : [one.meter, one.kind].filter(Boolean).join(", ");
+  return `${one.feeder}: ${what}`;
+}
+
+async function post(url, body) {
+  const response = await fetch(url, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+  const answer = await response.json();
+  if (!response.ok) throw new Error(answer.detail);
+  return answer;
+}
