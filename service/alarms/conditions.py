@@ -71,6 +71,7 @@ class AlarmEvidence:
         DataErrorReport | None,
         Field(description="Error of the feeder's files that explains the accusation as well."),
     ] = None
+    customer: Annotated[str | None, Field(description="Customer of the meter.")] = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +139,7 @@ def _evidence(meter: MeterState) -> AlarmEvidence:
         None if meter.model_only else number(meter.v_volt_estimated),
         None if meter.model_only else number(meter.attack_volt_estimated),
         meter.kind,
+        customer=meter.customer,
     )
 
 
@@ -259,6 +261,7 @@ def _voltage_limit(report: FeederReport, meter: MeterState) -> Iterable[Conditio
 
 def _data_loss(report: FeederReport) -> Iterable[Condition]:
     silent = {one.meter: one.seconds for one in report.silent}
+    owners = {meter.meter: meter.customer for meter in report.meters}
     unsure = [meter.meter for meter in report.meters if not meter.seen and meter.meter not in silent]
     busbar_seen = report.busbar.seen and report.cause is not Cause.NO_BUSBAR
     if not busbar_seen and BUSBAR not in silent:
@@ -268,7 +271,12 @@ def _data_loss(report: FeederReport) -> Iterable[Condition]:
         severity = Severity.MAJOR if meter == BUSBAR else Severity.MINOR
         length = "yet" if seconds is None else f"for {seconds:.0f} s"
         yield Condition(
-            AlarmKind.DATA_LOSS, report.feeder, meter, severity, reason=f"no usable reading {length}"
+            AlarmKind.DATA_LOSS,
+            report.feeder,
+            meter,
+            severity,
+            AlarmEvidence(customer=owners.get(meter)),
+            f"no usable reading {length}",
         )
     for meter in unsure:
         yield Condition(AlarmKind.DATA_LOSS, report.feeder, meter, Severity.MINOR, known=False)
@@ -298,14 +306,15 @@ def _undecided(report: FeederReport) -> Iterable[Condition]:
 
 
 def _clocks(report: FeederReport) -> Iterable[Condition]:
-    each = [(meter.meter, meter.clock_offset_s) for meter in report.meters]
-    for meter, offset in (*each, (BUSBAR, report.busbar.clock_offset_s)):
+    each = [(meter.meter, meter.customer, meter.clock_offset_s) for meter in report.meters]
+    for meter, customer, offset in (*each, (BUSBAR, None, report.busbar.clock_offset_s)):
         if offset is None:
             continue
         side = "ahead of" if offset > 0.0 else "behind"
         late = "" if offset > 0.0 else ", or its readings come later"
         reason = f"the clock is {abs(offset):.1f} s {side} the other meters'{late}"
-        yield Condition(AlarmKind.CLOCK_OFFSET, report.feeder, meter, Severity.MINOR, reason=reason)
+        evidence = AlarmEvidence(customer=customer)
+        yield Condition(AlarmKind.CLOCK_OFFSET, report.feeder, meter, Severity.MINOR, evidence, reason)
 
 
 def _learning(report: FeederReport) -> Iterable[Condition]:

@@ -4,7 +4,7 @@ import { Alarms } from "./alarms.js";
 import { Commissioning } from "./commissioning.js";
 import { showDetail } from "./detail.js";
 import { Diagram } from "./diagram.js";
-import { bare, busbarWords, byId, clock, duration, el, getJson, isKnown, signed, status, volt } from "./dom.js";
+import { bare, busbarWords, byId, clock, deviceName, duration, el, getJson, isKnown, signed, status, volt } from "./dom.js";
 import { Fleet, worstFirst } from "./fleet.js";
 import { session } from "./session.js";
 
@@ -171,12 +171,12 @@ function verdict() {
   const liar = report.busbar?.suspect ? [report.busbar] : [];
   const inverters = (report.inverters ?? []).filter((i) => i.suspect);
   byId("chips").replaceChildren(
-    ...[...suspects, ...liar].map((m) => chip(m.meter, "suspect", `${m.meter} ${signed(m.attack_volt_estimated)} V`)),
+    ...[...suspects, ...liar].map((m) => chip(m.meter, "suspect", `${deviceName(m.meter, customer.get(m.meter))} ${signed(m.attack_volt_estimated)} V`)),
     ...inverters.map((i) => el("button", {
       type: "button", class: "chip", "data-status": "suspect",
       text: `inverter of ${i.customer} ${signed(i.attack_kvar_estimated)} kvar`, on: { click: () => select(i.customer) },
     })),
-    ...report.silent.map((s) => chip(s.meter, "silent", `${s.meter} silent ${isKnown(s.seconds) ? duration(s.seconds) : ""}`)));
+    ...report.silent.map((s) => chip(s.meter, "silent", `${deviceName(s.meter, customer.get(s.meter))} silent ${isKnown(s.seconds) ? duration(s.seconds) : ""}`)));
   const several = diagram.level === null;
   const real = report.meters.filter((m) => !m.model_only).map((m) => (several ? m.v2_pu_estimated : m.v_volt_estimated)).filter(isKnown);
   const [low, high] = [Math.min(...real), Math.max(...real)].map((v) => (several ? Math.sqrt(v).toFixed(3) : bare(v)));
@@ -298,7 +298,7 @@ function table() {
     const now = status(m, limits, page.report);
     return el("tr", { "data-status": now.key },
       el("th", { scope: "row" }, customer.has(m.meter)
-        ? el("button", { type: "button", class: "plain", text: m.meter, on: { click: () => select(customer.get(m.meter)) } })
+        ? el("button", { type: "button", class: "plain", text: deviceName(m.meter, customer.get(m.meter)), on: { click: () => select(customer.get(m.meter)) } })
         : el("span", { text: m.meter })),
       el("td", { class: "num", text: bare(m.v_volt_reported) }),
       el("td", { class: "num", text: m.model_only && isKnown(m.v_volt_estimated) ? `model ${bare(m.v_volt_estimated)}` : bare(m.v_volt_estimated) }),
