@@ -5,7 +5,7 @@ import { Commissioning } from "./commissioning.js";
 import { showDetail } from "./detail.js";
 import { Diagram } from "./diagram.js";
 import { bare, busbarWords, byId, clock, deviceName, duration, el, getJson, isKnown, signed, status, volt } from "./dom.js";
-import { Fleet, worstFirst } from "./fleet.js";
+import { Fleet } from "./fleet.js";
 import { session } from "./session.js";
 
 const API = "/api/v1/feeders";
@@ -36,25 +36,22 @@ const commissioning = new Commissioning({ onChange: () => detail() });
 
 async function start() {
   await session.begin();
+  const wanted = decodeURIComponent(location.hash.slice(1));
   let feeders;
   try {
-    ({ feeders } = await getJson(API));
+    feeders = await fleet.first(wanted);
   } catch {
     page.linked = false;
     setTimeout(start, 3000);
     return;
   }
-  feeders.sort(worstFirst);
-  byId("feeder").replaceChildren(...feeders.map((f) => el("option", { value: f.name, text: f.title || f.name })));
-  byId("feeder").disabled = feeders.length < 2;
   if (!feeders.length) {
     byId("reason").textContent = "The service monitors no feeder yet.";
     setTimeout(start, 5000);
     return;
   }
-  fleet.begin(feeders);
-  const wanted = decodeURIComponent(location.hash.slice(1));
-  await show(feeders.some((f) => f.name === wanted) ? wanted : feeders[0].name);
+  fleet.begin();
+  await show(fleet.beside.has(wanted) ? wanted : feeders[0].name);
 }
 
 async function show(name) {
@@ -77,7 +74,6 @@ async function show(name) {
   page.heard = null;
   page.past = new Map();
   page.opened = performance.now();
-  byId("feeder").value = name;
   fleet.select(name);
   history.replaceState(null, "", `#${encodeURIComponent(name)}`);
   byId("meters").replaceChildren();
@@ -92,7 +88,7 @@ async function show(name) {
 // The service responds with the reason why this feeder is not monitored.
 function refused(name, why) {
   Object.assign(page, { feeder: null, report: null, heard: null, past: new Map(), refused: why, linked: true });
-  byId("feeder").value = name;
+  fleet.select(name);
   history.replaceState(null, "", `#${encodeURIComponent(name)}`);
   byId("meters").replaceChildren();
   select(null);
@@ -157,7 +153,7 @@ function verdict() {
   byId("reason").textContent = report ? report.reason : page.refused ?? "Waiting for the first tick.";
   byId("busbar-meter").hidden = !report?.busbar?.suspect;
   byId("busbar-meter").textContent = report?.busbar?.suspect ? busbarWords(report.busbar) : "";
-  title(report ? decision.toUpperCase() : "…");
+  title(report ? decision.toUpperCase() : page.refused ? "NOT MONITORED" : "NO DATA");
   if (!report) {
     byId("chips").replaceChildren();
     byId("facts").replaceChildren();
@@ -195,6 +191,7 @@ function verdict() {
 // Title of the tab: attacked feeders besides the shown one come first.
 function title(word = page.word) {
   page.word = word;
+  fleet.mark(word);
   const others = page.others ? `${page.others} ATTACKED | ` : "";
   document.title = `${others}${word} – ${page.feeder?.title || page.feeder?.name || ""} – gridsec`;
 }
@@ -309,7 +306,6 @@ function table() {
   byId("meters").replaceChildren(...rows);
 }
 
-byId("feeder").addEventListener("change", (event) => show(event.target.value));
 byId("unselect").addEventListener("click", () => select(null));
 byId("replaced").addEventListener("click", () => {
   const { meter } = page.feeder.layout.customers.find((c) => c.customer === page.selected);

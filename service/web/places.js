@@ -8,6 +8,7 @@ const UPRIGHT = { step: [32, 32], row: [62, 120] };
 const NARROW = 620; // Width below which rows stand upright, px.
 const FEW = 8; // Columns that fit a narrow window without that.
 const PAD = 26;
+const BEND = 18; // Largest height of a tie above its row, px.
 const SMALL = 0.7; // Least magnification of the whole drawing before branches collapse.
 const SMALLEST = 0.45; // The same while nothing must be read: no customer stands out.
 
@@ -32,9 +33,10 @@ function placed(layout, { width, height }, { shown, whole }, { step, row, uprigh
   const along = clamp((along0 - 2 * PAD - 10) / grid.columns, step);
   const across = clamp((across0 - PAD - 12) / grid.rows, row);
   const size = clamp(Math.min(along / 52, across / 76), [1, 1.35]);
+  const air = layout.ties?.length ? BEND : 0; // Room for ties of the first row.
   const at = (x, line) => (upright
-    ? { x: PAD + line * across, y: PAD + 12 + x * along }
-    : { x: PAD + x * along, y: PAD + 6 + line * across });
+    ? { x: PAD + air + line * across, y: PAD + 12 + x * along }
+    : { x: PAD + x * along, y: PAD + 6 + air + line * across });
   const drop = Math.min(29 * size, across - 24);
   const hang = upright ? { x: 28, y: 0 } : { x: 0, y: drop };
   const hung = (place) => ({ x: place.x + hang.x, y: place.y + hang.y });
@@ -92,7 +94,7 @@ function ties(layout, grid, stubs, { at, hung, upright }) {
       const [origin, there] = [at(0, 0), places.get(far) ?? at(0, 0)];
       return upright ? { x: there.x, y: origin.y } : { x: origin.x, y: there.y };
     });
-    const bend = Math.min(36, 12 + 0.2 * Math.hypot(b.x - a.x, b.y - a.y));
+    const bend = Math.min(2 * BEND, 12 + 0.2 * Math.hypot(b.x - a.x, b.y - a.y));
     const middle = { x: (a.x + b.x) / 2 - (upright ? bend : 0), y: (a.y + b.y) / 2 - (upright ? 0 : bend) };
     return { d: `M${a.x} ${a.y}Q${middle.x} ${middle.y} ${b.x} ${b.y}`, kind: "tie" };
   });

@@ -49,7 +49,12 @@ def test_the_worst_feeder_comes_first(
     expect(first.locator("td").nth(3)).to_have_text("0 %")
     # A clean feeder never hides attacked ones.
     expect(page).to_have_title("1 ATTACKED | CLEAN – A-quiet, 4 customers – gridsec")
-    assert page.locator("#feeder option").first.inner_text().startswith("C-attacked")
+    assert page.locator("#feeder option").all_inner_texts() == [
+        "ATTACKED – C-attacked, 4 customers",
+        "UNDECIDED – B-doubtful, 4 customers",
+        "NO DATA – D, 4 customers",
+        "CLEAN – A-quiet, 4 customers",
+    ]
     first.locator("button").click()
     expect(page.locator("#decision")).to_have_text("ATTACKED")
     expect(page).to_have_title("ATTACKED – C-attacked, 4 customers – gridsec")
