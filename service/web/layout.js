@@ -225,11 +225,13 @@ export function oneLine(layout, { tree = contracted(layout), loud = null, side: 
   if (at[0].length || whole.length) {
     let x = 1;
     for (const customer of at[0]) all.customers.push({ customer, bus: 0, from: 0, x: x++, row });
-    for (const child of whole) {
+    const single = whole.filter((child) => isDrop(child) && weight[child] < least(child));
+    for (const child of single) for (const customer of at[child]) all.customers.push({ customer, bus: child, from: 0, x: x++, row });
+    for (const child of whole.filter((each) => !single.includes(each))) {
       all.stubs.push(stub(child, { from: 0, x, row, inline: false }));
       x += 2;
     }
-    all.lines.push({ bus: 0, through: [], x: x - 1 - (whole.length ? 0.5 : 0), row, x0: 0, row0: row, busbar: true });
+    all.lines.push({ bus: 0, through: [], x: x - 1 - (all.stubs.length ? 0.5 : 0), row, x0: 0, row0: row, busbar: true });
     columns = x;
     row += 1;
   }
