@@ -8,7 +8,8 @@ import { Scale } from "./scale.js";
 import { Viewport } from "./viewport.js";
 
 const HOLD_S = 60; // Time for which a branch stays open after its last suspect, s.
-const ROOM = 44; // Least distance of customers with labels, px.
+const ROOM = [44, 72]; // Least distance of customers with labels, and of their rows, px.
+const OPENED = 30; // Customers of a branch that open at once; those behind stay collapsed.
 const MARGIN = 34; // Least distance of a visible suspect from the edge of the window, px.
 const PHONE = 620; // Width of a narrow window, px.
 
@@ -38,7 +39,7 @@ const LEGEND = [
   ["low", "below limit"],
   ["none", "no meter"],
 ];
-const WORDS = { ok: "consistent", doubtful: "doubtful", unjudged: "not monitored", silent: "silent", none: "without a meter" };
+const WORDS = { ok: "consistent", high: "above limit", low: "below limit", doubtful: "doubtful", unjudged: "not monitored", silent: "silent", none: "without a meter" };
 
 // Length of the part that all names begin with, up to a word.
 function sharedPrefix(names) {
@@ -62,7 +63,8 @@ export class Diagram {
     this.selected = this.hovered = this.waiting = null;
     this.drawn = "";
     this.opened = new Set(); // Customers of branches that the operator expanded.
-    this.last = new Map(); // Time of the last tick at which a customer stood out, Unix s.
+    this.last = new Map(); // Time of the last tick at which a customer was suspect, Unix s.
+    this.beyond = new Map(); // The same for a voltage beyond the limits.
     this.viewport = new Viewport(this.box, () => this.moved());
     new ResizeObserver(() => {
       if (this.feeder && this.drawn !== this.window().key) this.build();
@@ -93,6 +95,7 @@ export class Diagram {
     this.report = null;
     this.opened.clear();
     this.last.clear();
+    this.beyond.clear();
     this.whole = this.collapsible = false; // All branches are expanded; some collapse.
     this.mapped = hasMap(feeder.layout);
     byId("view").hidden = !this.mapped;
@@ -127,20 +130,23 @@ export class Diagram {
     return { width, height, key: `${width >> 3} ${height >> 4}` };
   }
 
-  // Customers that stand out, or did until a short time ago; they never collapse.
-  shown() {
+  // Customers that never collapse: suspects, until a short time ago, and those that the operator has chosen.
+  // Customers beyond the limits collapse only if the drawing does not fit otherwise.
+  standing() {
     const now = this.report?.t ?? 0;
-    const names = this.feeder.layout.customers;
-    return new Set(names.map((_, k) => k).filter((k) => {
-      const { customer } = names[k];
-      return this.opened.has(customer) || customer === this.selected || Math.abs(now - (this.last.get(customer) ?? -Infinity)) <= HOLD_S;
-    }));
+    const names = this.feeder.layout.customers.map(({ customer }) => customer);
+    const recent = (times, name) => Math.abs(now - (times.get(name) ?? -Infinity)) <= HOLD_S;
+    const which = (test) => new Set([...names.keys()].filter((k) => test(names[k])));
+    return {
+      shown: which((name) => this.opened.has(name) || name === this.selected || recent(this.last, name)),
+      beyond: which((name) => recent(this.beyond, name)),
+    };
   }
 
   places() {
     const window = this.window();
     if (this.view === "map") return mapPlaces(this.feeder.layout, window);
-    return onePlaces(this.feeder.layout, window, { shown: this.shown(), whole: this.whole });
+    return onePlaces(this.feeder.layout, window, { ...this.standing(), whole: this.whole });
   }
 
   // Draw again if other branches collapse now.
@@ -242,7 +248,7 @@ export class Diagram {
   // ------------------------------------------------------- branches and view
 
   expand({ stub }) {
-    const names = stub.customers.map((k) => this.feeder.layout.customers[k].customer);
+    const names = stub.customers.slice(0, OPENED).map((k) => this.feeder.layout.customers[k].customer);
     for (const name of names) this.opened.add(name);
     const { manual } = this.viewport;
     this.build();
@@ -285,13 +291,13 @@ export class Diagram {
   // The view has changed: sizes of the symbols, labels.
   moved() {
     const { k, dx, dy } = this.viewport;
-    const { gap, size } = this.placed;
+    const { gap, pitch, size } = this.placed;
     const map = this.view === "map";
     const [quiet, loud] = map ? [clamp((gap * k) / 20, 0.4, 1), clamp((gap * k) / 20, 0.8, 1)] : [clamp(k * size, 0.5, 1.35), clamp(k * size, 0.75, 1.35)];
     this.world.setAttribute("transform", `translate(${dx} ${dy}) scale(${k})`);
     for (const [name, value] of [["--quiet-size", quiet / k], ["--loud-size", loud / k], ["--still", 1 / k]]) this.world.style.setProperty(name, value);
     this.sizes = { quiet, loud };
-    this.world.classList.toggle("named", gap * k >= ROOM && !this.placed.upright);
+    this.world.classList.toggle("named", gap * k >= ROOM[0] && pitch * k >= ROOM[1] && !this.placed.upright);
     this.world.classList.toggle("thin", k < 0.6);
     this.hover(null);
     this.waiting ??= requestAnimationFrame(() => { this.waiting = null; this.label(); });
@@ -305,6 +311,7 @@ export class Diagram {
     const seen = all.filter((part) => viewport.holds(part, -MARGIN / 3));
     const marks = seen.map((part) => ({ ...viewport.at(part), radius: 12 * sizes.loud, lines: part.lines }));
     const others = [...(this.customers?.values() ?? [])].filter((part) => part.key !== "suspect").map((part) => ({ ...viewport.at(part), radius: 8 * sizes.quiet }));
+    others.push(...this.stubs.map((stub) => ({ ...viewport.at(stub), radius: 11 * sizes.loud, wide: 25 * sizes.loud })));
     const places = placeLabels(marks, others, viewport.size);
     seen.forEach(({ note }, k) => {
       const { x, y, anchor } = places[k];
@@ -337,7 +344,8 @@ export class Diagram {
     const accused = new Set((report.inverters ?? []).filter((i) => i.suspect).map((i) => i.customer));
     for (const customer of this.feeder.layout.customers) {
       const { key } = status(this.meters.get(customer.meter), this.limits, report);
-      if (["suspect", "high", "low"].includes(key) || accused.has(customer.customer)) this.last.set(customer.customer, report.t);
+      if (key === "suspect" || accused.has(customer.customer)) this.last.set(customer.customer, report.t);
+      if (key === "high" || key === "low") this.beyond.set(customer.customer, report.t);
     }
     this.relayout();
     this.paint();
@@ -407,8 +415,9 @@ export class Diagram {
     part.shape.style.fill = fill;
     part.sign.textContent = SIGN[now.key] ?? "";
     part.note.classList.toggle("loud", loud);
-    part.note.setAttribute("text-anchor", "middle");
-    part.note.replaceChildren(...lines.map((line, k) => svg("tspan", { x: 0, y: 26 + 13 * k, text: line })));
+    const beside = this.view === "map"; // A line mostly goes on below.
+    part.note.setAttribute("text-anchor", beside ? "start" : "middle");
+    part.note.replaceChildren(...lines.map((line, k) => svg("tspan", { x: beside ? 11 : 0, y: (beside ? 4 : 26) + 13 * k, text: line })));
     part.group.setAttribute("aria-label", text);
     part.group.classList.toggle("selected", customer.customer === this.selected);
     // Suspects cover their neighbours.
@@ -439,10 +448,10 @@ export class Diagram {
     const text = [`${part.stub.customers.length} customers`, ...Object.keys(WORDS).filter((key) => count.has(key)).map((key) => `${count.get(key)} ${WORDS[key]}`), range].join(", ");
     if (part.text === text) return;
     part.text = text;
-    const worst = ["doubtful", "silent", "unjudged"].find((key) => count.has(key)) ?? "ok";
+    const worst = ["high", "low", "doubtful", "silent", "unjudged"].find((key) => count.has(key)) ?? "ok";
     part.group.setAttribute("data-status", worst);
     part.group.setAttribute("aria-label", `Collapsed branch: ${text}`);
-    part.count.textContent = `▸ ${part.stub.customers.length}${SIGN[worst] ?? ""}`;
+    part.count.textContent = `▸ ${part.stub.customers.length}${{ ...SIGN, high: "▲", low: "▼" }[worst] ?? ""}`;
   }
 
   // ---------------------------------------------------------------- the operator

@@ -7,9 +7,9 @@ const LINE = 13; // Height of a line, px.
 const over = (a, b) => a.x < b.x + b.width && b.x < a.x + a.width && a.y < b.y + b.height && b.y < a.y + a.height;
 
 /* Places of labels in the window. `marks`: point { x, y }, radius, lines of text; in the order of their rank.
-   `others`: points and radii of all other symbols.
+   `others`: points and radii of all other symbols; `wide`: half their width, if larger.
    Returns for each mark { x, y, anchor } of its first line relative to the point. */
-const square = ({ x, y, radius }) => ({ x: x - radius, y: y - radius, width: 2 * radius, height: 2 * radius });
+const square = ({ x, y, radius, wide = radius }) => ({ x: x - wide, y: y - radius, width: 2 * wide, height: 2 * radius });
 
 export function placeLabels(marks, others, { width, height }) {
   const taken = marks.map(square);

@@ -44,14 +44,15 @@ export function contracted({ buses, parent, customers, ties = [] }) {
   return { children, at, weight, through, from, leftOut, size: n };
 }
 
-// All customers and all buses below a drawn bus, itself included.
+// All customers and all buses below a drawn bus, itself included, the nearest first.
 function below(tree, start) {
   const found = { customers: [], buses: [] };
-  for (const stack = [start]; stack.length; ) {
-    const bus = stack.pop();
+  const queue = [start];
+  for (let k = 0; k < queue.length; k += 1) {
+    const bus = queue[k];
     found.customers.push(...tree.at[bus]);
     found.buses.push(...tree.through[bus]);
-    stack.push(...tree.children[bus]);
+    queue.push(...tree.children[bus]);
   }
   return found;
 }

@@ -4,7 +4,7 @@ import { fitted } from "./layout.js";
 
 const STEP = [26, 104]; // Least and largest length of a step along a row, px.
 const ROW = [58, 120]; // Least and largest distance of rows, px.
-const UPRIGHT = { step: [32, 32], row: [62, 120] };
+const UPRIGHT = { step: [32, 32], row: [84, 120] };
 const NARROW = 620; // Width below which rows stand upright, px.
 const FEW = 8; // Columns that fit a narrow window without that.
 const PAD = 26;
@@ -18,11 +18,16 @@ const clamp = (value, [low, high]) => Math.min(high, Math.max(low, value));
 const least = (shown) => (shown.size ? SMALL : SMALLEST);
 
 /* The one-line view.
-   window: width and height, px; shown: customers that never collapse; whole: nothing collapses. */
-export function onePlaces(layout, window, { shown, whole }) {
-  const lying = placed(layout, window, { shown, whole }, { step: STEP, row: ROW, upright: false });
+   window: width and height, px; shown: customers that never collapse; whole: nothing collapses; beyond: customers
+   that collapse only if the drawing does not fit otherwise. */
+export function onePlaces(layout, window, { shown, whole, beyond = new Set() }) {
+  const best = (shape) => {
+    const all = placed(layout, window, { shown: new Set([...shown, ...beyond]), whole }, shape);
+    return all.fits || !beyond.size ? all : placed(layout, window, { shown, whole }, shape);
+  };
+  const lying = best({ step: STEP, row: ROW, upright: false });
   const upright = window.width < NARROW && (lying.grid.columns > FEW || lying.grid.stubs.length > 0);
-  return upright ? placed(layout, window, { shown, whole }, { ...UPRIGHT, upright }) : lying;
+  return upright ? best({ ...UPRIGHT, upright }) : lying;
 }
 
 function placed(layout, { width, height }, { shown, whole }, { step, row, upright }) {
@@ -72,7 +77,7 @@ function placed(layout, { width, height }, { shown, whole }, { step, row, uprigh
   wires.push({ d: upright ? `M${first.x - 12} ${first.y}H${last.x + 12}` : `M${first.x} ${first.y - 12}V${last.y + 12}`, bus: 0, kind: "busbar" });
   const end = at(grid.columns - 1, grid.rows - 1);
   return {
-    grid, wires, spots, stubs, upright, size, gap: along,
+    grid, fits: fits(grid), wires, spots, stubs, upright, size, gap: along, pitch: across,
     world: upright ? { width: end.x + 84, height: end.y + 24 } : { width: Math.max(end.x + PAD + 12, 200), height: end.y + drop + 52 * size },
     // Beyond the end of the busbar, where the drawing is empty.
     busbar: upright ? { x: last.x + 27, y: first.y } : { x: first.x, y: last.y + 27 },
@@ -138,7 +143,7 @@ export function mapPlaces(layout, window) {
     return { customer: k, x: place.x + 15 * count, y: place.y, order: k };
   });
   return {
-    wires, spots, stubs: [], upright: false, size: 1, gap: spacing(spots), world, busbar: { x, y: y - 20 },
+    wires, spots, stubs: [], upright: false, size: 1, gap: spacing(spots), pitch: Infinity, world, busbar: { x, y: y - 20 },
     station: { x, y }, title: `Map, ${customers.length} customers`,
   };
 }
