@@ -205,15 +205,11 @@ def in_browser(url: str, fleet: Fleet) -> str:
         changes = []
         clean = [name for name, one in fleet.monitors.items() if one.report and one.report.verdict == "clean"]
         total = len(fleet.monitors) - len(clean)
-        for name in clean[:CHANGES]:
+        for name in clean[1 : CHANGES + 1]:
             fleet.attack(name)
             total += 1
             begun = time.perf_counter()
-            page.wait_for_function(
-                "n => document.querySelector('#fleet-counts [data-state=attacked]').textContent.startsWith(n)",
-                arg=f"{total} ",
-                polling=20,
-            )
+            page.wait_for_selector(f'#fleet-counts [data-state="attacked"]:text-is("{total} attacked")')
             changes.append(time.perf_counter() - begun)
         page.locator("#fleet-all summary").click()
         page.wait_for_timeout(500)

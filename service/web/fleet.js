@@ -31,7 +31,7 @@ export class Fleet {
     this.nodes = new Map();
     this.turn = 0;
     byId("fleet-all").addEventListener("toggle", () => this.refresh());
-    byId("fleet-filter").addEventListener("input", () => this.refresh());
+    byId("fleet-filter").addEventListener("input", () => this.search());
     byId("fleet-scroll").addEventListener("scroll", () => this.scrolled());
     byId("fleet-rows").addEventListener("keydown", (event) => this.key(event));
     byId("feeder").addEventListener("change", (event) => onPick(event.target.value));
@@ -112,9 +112,13 @@ export class Fleet {
     this.render();
   }
 
-  // The short list ends with the first filter.
   filter(state) {
     if (!this.states.delete(state)) this.states.add(state);
+    this.search();
+  }
+
+  // The short list ends with the first filter.
+  search() {
     if (this.long) this.refresh();
     else byId("fleet-all").open = true;
   }
@@ -222,19 +226,18 @@ export class Fleet {
   cells(feeder) {
     const since = isKnown(feeder.since) && isKnown(feeder.t) && feeder.status === feeder.verdict ? duration(feeder.t - feeder.since) : "";
     const silent = feeder.meters ? `${Math.round((100 * feeder.silent) / feeder.meters)} %` : "";
-    const fresh = feeder.raised ? `, ${feeder.raised} new` : "";
-    return [feeder.status, titleOf(feeder), since, String(feeder.suspects || ""), silent, feeder.alarms ? `${feeder.alarms}${fresh}` : ""];
+    return [feeder.status, titleOf(feeder), since, String(feeder.suspects || ""), silent, String(feeder.alarms || ""), feeder.raised ? `, ${feeder.raised} new` : ""];
   }
 
   row(feeder, k) {
-    const [state, title, since, suspects, silent, alarms] = this.cells(feeder);
+    const [state, title, since, suspects, silent, alarms, fresh] = this.cells(feeder);
     return el("tr", { "data-state": state, "data-feeder": feeder.name, "aria-rowindex": k + 2, "aria-current": feeder.name === this.selected ? "true" : null },
       el("td", {}, el("span", { class: "fleet-state", "data-state": state, text: WORDS[state] })),
       el("th", { scope: "row" }, el("button", { type: "button", class: "plain", text: title, title, on: { click: () => this.onPick(feeder.name) } })),
       el("td", { class: "num", text: since }),
       el("td", { class: "num", text: suspects }),
       el("td", { class: "num", text: silent }),
-      el("td", { class: "num", text: alarms }));
+      el("td", { class: "num" }, alarms, el("span", { class: "fresh", text: fresh })));
   }
 
   // Arrow keys walk through all rows, also those that are not loaded yet.
