@@ -73,6 +73,7 @@ class AlarmEvidence:
         DataErrorReport | None,
         Field(description="Error of the feeder's files that explains the accusation as well."),
     ] = None
+    customer: Annotated[str | None, Field(description="Customer of the meter.")] = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +151,7 @@ def _evidence(meter: MeterState) -> AlarmEvidence:
         None if meter.model_only else number(meter.v_volt_estimated),
         None if meter.model_only else number(meter.attack_volt_estimated),
         meter.kind,
+        customer=meter.customer,
     )
 
 
@@ -271,6 +273,7 @@ def _voltage_limit(report: FeederReport, meter: MeterState) -> Iterable[Conditio
 
 def _data_loss(report: FeederReport) -> Iterable[Condition]:
     silent = {one.meter: one.seconds for one in report.silent}
+    owners = {meter.meter: meter.customer for meter in report.meters}
     most = _most_silent(report)
     if most:
         yield _outage(report, most)
@@ -286,7 +289,8 @@ def _data_loss(report: FeederReport) -> Iterable[Condition]:
             report.feeder,
             meter,
             severity,
-            reason=f"no usable reading {_length(seconds)}",
+            AlarmEvidence(customer=owners.get(meter)),
+            f"no usable reading {_length(seconds)}",
             known=not most,
         )
     for meter in unsure:
@@ -361,14 +365,15 @@ def identity_mismatches(feeder: str, refused: Mapping[str, str]) -> list[Conditi
 
 
 def _clocks(report: FeederReport) -> Iterable[Condition]:
-    each = [(meter.meter, meter.clock_offset_s) for meter in report.meters]
-    for meter, offset in (*each, (BUSBAR, report.busbar.clock_offset_s)):
+    each = [(meter.meter, meter.customer, meter.clock_offset_s) for meter in report.meters]
+    for meter, customer, offset in (*each, (BUSBAR, None, report.busbar.clock_offset_s)):
         if offset is None:
             continue
         side = "ahead of" if offset > 0.0 else "behind"
         late = "" if offset > 0.0 else ", or its readings come later"
         reason = f"the clock is {abs(offset):.1f} s {side} the other meters'{late}"
-        yield Condition(AlarmKind.CLOCK_OFFSET, report.feeder, meter, Severity.MINOR, reason=reason)
+        evidence = AlarmEvidence(customer=customer)
+        yield Condition(AlarmKind.CLOCK_OFFSET, report.feeder, meter, Severity.MINOR, evidence, reason)
 
 
 def _learning(report: FeederReport) -> Iterable[Condition]:

@@ -30,6 +30,7 @@ from service.alarms.incidents import Incident, IncidentEvent, PlannedWork, Shelf
 from service.alarms.state_machine import Alarm
 from service.engine.commissioning import CommissioningProgress, MeterCommissioning
 from service.notify.delivery import TargetStatus
+from service.report.feeder_info import FeederStatus
 from service.report.report import FeederReport, MeterState, ModelOnly
 from service.store import AlarmEvent
 from service.store.incidents import Said
@@ -123,6 +124,9 @@ class FeederSummary(BaseModel):
         default=None, description="Number of skipped ticks since the start; null if not monitored."
     )
     verdict: Decision | None = None
+    status: FeederStatus = Field(
+        description="Its verdict; `no-data` without present readings, `not-monitored` after a failure."
+    )
     model_only: bool | None = Field(default=None, description="As in the state; null before the first tick.")
     since: float | None = Field(default=None, description="First consecutive tick with this verdict, Unix s.")
     displayed_verdict: Decision | None = Field(
@@ -134,13 +138,18 @@ class FeederSummary(BaseModel):
     meters: int = Field(default=0, description="Number of meters at the latest tick.")
     suspects: int = Field(default=0, description="Meters and inverters named as manipulated at that tick.")
     silent: int = Field(default=0, description="Silent meters of customers at that tick.")
+    alarms: int = Field(default=0, description="Active alarms.")
     raised: int = Field(default=0, description="Active alarms without an acknowledgement.")
 
 
 class Feeders(BaseModel):
-    """All feeders."""
+    """All feeders, or a page of them."""
 
     feeders: list[FeederSummary]
+    total: int = Field(description="Number of feeders that fit the filters, on this page or not.")
+    counts: dict[FeederStatus, int] = Field(
+        description="Number of feeders by status, whatever the filters are."
+    )
 
 
 class LayoutCustomer(BaseModel):

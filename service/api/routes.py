@@ -43,7 +43,7 @@ from service.alarms.incidents import (
     WorkUnknown,
 )
 from service.alarms.state_machine import Alarm, AlarmKind, AlarmState, AlarmUnknown, Severity
-from service.api import guide, models, tables
+from service.api import guide, models, overview, tables
 from service.api.access import COOKIE, FRESH_S, Authenticator, authorise, client_of, session_of
 from service.api.description import BODY, TAGS, feeder_schemas
 from service.api.errors import Guard, HeadAsGet, handlers, problem
@@ -51,6 +51,7 @@ from service.engine.commissioning import CommissioningProgress
 from service.engine.operators import Operators, ShelfRequest
 from service.errors import FeederNotLoaded, FeederUnknown
 from service.notify.delivery import Notifier
+from service.report.feeder_info import FeederStatus
 from service.report.report import BUSBAR, FeederReport
 from service.settings import is_loopback
 from service.store import AlarmEvent, Store, StoreUnavailable
@@ -438,25 +439,6 @@ def _unchanged(response: Response, tag: str, if_none_match: str | None) -> Respo
 _feeders = APIRouter(prefix="/api/v1/feeders", tags=["feeders"], dependencies=[Depends(_known_query)])
 
 
-def _summary(backend: Backend, fields: dict[str, Any], raised: int) -> models.FeederSummary:
-    report = backend.report(fields["name"])
-    now: dict[str, Any] = {"raised": raised}
-    if report is not None:
-        now |= {
-            "t": report.t,
-            "verdict": report.verdict,
-            "age_s": backend.age(report),
-            "model_only": report.model_only,
-            "since": report.since,
-            "displayed_verdict": None if report.displayed is None else report.displayed.verdict,
-            "displayed_since": None if report.displayed is None else report.displayed.since,
-            "meters": len(report.meters),
-            "suspects": len(report.suspects) + sum(inverter.suspect for inverter in report.inverters),
-            "silent": sum(one.meter != BUSBAR for one in report.silent),
-        }
-    return models.FeederSummary.model_validate({**fields, **now})
-
-
 def _detail(backend: Backend, feeder: str) -> dict[str, Any]:
     fields = backend.feeder(feeder)
     if fields is None:
@@ -465,11 +447,31 @@ def _detail(backend: Backend, feeder: str) -> dict[str, Any]:
 
 
 @_feeders.get("")
-def list_feeders(backend: BackendHere, caller: Caller) -> models.Feeders:
-    """All feeders, with the latest verdict of each."""
-    seen = [fields for fields in backend.feeders() if caller.sees(fields["name"])]
-    raised = backend.store.raised_by_feeder()
-    return models.Feeders(feeders=[_summary(backend, each, raised.get(each["name"], 0)) for each in seen])
+def list_feeders(
+    backend: BackendHere,
+    caller: Caller,
+    *,
+    order: Annotated[
+        overview.Order, Query(description="`worst`: by status, suspects, new alarms and time.")
+    ] = overview.Order.GIVEN,
+    text: Annotated[str, Query(max_length=100, description="Only those with it in name or title.")] = "",
+    status: Annotated[list[FeederStatus], Query(description="Only those with one of these.")] = [],  # noqa: B006
+    include: Annotated[
+        str | None, Query(pattern=_NAME, description="Feeder that follows the page if it is not on it.")
+    ] = None,
+    offset: Annotated[int, Query(ge=0, le=MAX_EVENT, description="Number of feeders before the page.")] = 0,
+    limit: Annotated[int | None, Query(ge=1, le=5000, description="Without it all.")] = None,
+) -> models.Feeders:
+    """All feeders with the latest verdict of each, or a page of them, the worst first."""
+    alarms = backend.store.alarms_by_feeder()
+    found = []
+    for fields in backend.feeders():
+        if caller.sees(name := fields["name"]):
+            report = backend.report(name)
+            age = None if report is None else backend.age(report)
+            found.append(overview.standing(fields, report, age, alarms.get(name)))
+    part = (offset, limit)
+    return overview.page(found, order=order, text=text, status=status, include=include, part=part)
 
 
 @_feeders.get("/{feeder}", response_model=models.FeederDetail, responses=_NOT_MODIFIED)

@@ -277,24 +277,29 @@ class FeederCommissioning:
             return None
         return watcher.bias_learning.progress(watcher.design, known)
 
+    @property
+    def stage(self) -> Stage:
+        """State of the learning, without the numbers of the meters."""
+        if self._watcher is not None and self.learner is None:
+            return Stage.OFF
+        if self.known is None:
+            return Stage.WAITING
+        learning = self.known.learning
+        still = learning is not None and bool(np.isfinite(learning.since).any())
+        return Stage.LEARNING if still else Stage.LEARNED
+
     def progress(self) -> CommissioningProgress:
         """Return the progress."""
-        known, learner, monitor = self.known, self.learner, self._site.tables.meta.monitor
+        known, monitor = self.known, self._site.tables.meta.monitor
         found = self._found(known)
         meters = () if known is None or found is None else self._meters(known, found)
         still = [m for m in meters if m.state is Stage.LEARNING]
-        if self._watcher is not None and learner is None:
-            state = Stage.OFF
-        elif known is None:
-            state = Stage.WAITING
-        else:
-            state = Stage.LEARNING if still else Stage.LEARNED
         needed = monitor.commission_s
         held = any(m.gathered_s is not None and m.gathered_s >= needed for m in still)
         return CommissioningProgress(
             feeder=self._site.feeder.name,
             estimator=monitor.estimator,
-            state=state,
+            state=self.stage,
             t=self._t,
             tick_s=monitor.tick_s,
             needed_s=needed,

@@ -319,7 +319,7 @@ class Runtime:
                 "problem": monitor.problem or None,
                 "patience_s": monitor.patience_s,
                 "ticks_skipped": monitor.skipped,
-                "commissioning": str(monitor.commissioning.progress().state),
+                "commissioning": str(monitor.commissioning.stage),
             }
             for monitor in self._engine.monitors.values()
         ]

@@ -5,10 +5,37 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from enum import StrEnum
 from typing import Any
 
 from feeders.format.tables import to_json
 from feeders.model.site import Site
+from service.report.report import FeederReport
+
+
+class FeederStatus(StrEnum):
+    """Status of a feeder in the list of feeders, the worst first."""
+
+    ATTACKED = "attacked"
+    UNDECIDED = "undecided"
+    NO_DATA = "no-data"  # no verdict from present readings: none yet, model only, or stale
+    NOT_MONITORED = "not-monitored"  # the feeder or its monitor failed
+    CLEAN = "clean"
+
+
+def status_of(
+    report: FeederReport | None, age_s: float | None, patience_s: float | None, *, failed: bool = False
+) -> FeederStatus:
+    """Return the status of a feeder: its displayed verdict, unless no value uses a present reading.
+
+    report: the latest report; None before the first tick. A report older than `patience_s`, s, is stale.
+    """
+    if failed:
+        return FeederStatus.NOT_MONITORED
+    stale = age_s is not None and patience_s is not None and age_s > patience_s
+    if report is None or report.model_only or stale:
+        return FeederStatus.NO_DATA
+    return FeederStatus(str(report.verdict if report.displayed is None else report.displayed.verdict))
 
 
 def summary(site: Site) -> dict[str, Any]:

@@ -392,7 +392,7 @@ _SHOWN: Final = 5
 
 
 def reason_of(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> str:
-    """Return the reason of a verdict, with the meters' ids as in alarms: the monitor uses customers only."""
+    """Return the reason of a verdict, with the meters' names as on the page: the monitor uses customers only."""
     suspects = np.flatnonzero(verdict.suspects).tolist()
     unseen = [k for k, reading in enumerate(tick.readings) if reading is None]
     named = _listed(site, suspects)
@@ -435,14 +435,27 @@ def _ways(site: Site, verdict: Verdict) -> str:
     return f"{begin}: {' or else '.join(ways[:_SHOWN])}{more}."
 
 
+def device_name(meter: str, customer: str) -> str:
+    """Return the name of a meter in sentences and on the page: its id, then its customer, `m04 · Load 3`.
+
+    A customer with a number as its id is `customer 3`; an id that both have stands once.
+    """
+    owner = f"customer {customer}" if customer[:1].isdigit() else customer
+    return meter if customer in {"", meter} else f"{meter} · {owner}"
+
+
+def _meter_name(site: Site, k: int) -> str:
+    return device_name(site.meter_ids[k], site.feeder.customers[int(site.meters[k])])
+
+
 def _listed(site: Site, which: Sequence[int]) -> str:
-    """Ids of meters, at most `_SHOWN`."""
+    """Names of meters, at most `_SHOWN`."""
     rest = f" and {len(which) - _SHOWN} more" if len(which) > _SHOWN else ""
-    return ", ".join(site.meter_ids[k] for k in which[:_SHOWN]) + rest
+    return ", ".join(_meter_name(site, k) for k in which[:_SHOWN]) + rest
 
 
 def _who(site: Site, meters: Bools, inverters: Bools, powers: Bools | None = None, *, busbar: Bools) -> str:
-    """Meters by their ids, other devices by their customers, as in alarms; at most `_SHOWN` of a kind."""
+    """Meters by their names, other devices by their customers; at most `_SHOWN` of a kind."""
     found = np.flatnonzero(meters).tolist()
     parts = [_listed(site, found)] if found else []
     doubted = () if powers is None else np.flatnonzero(powers)
@@ -457,14 +470,13 @@ def _who(site: Site, meters: Bools, inverters: Bools, powers: Bools | None = Non
 
 
 def _in_ids(site: Site, text: str) -> str:
-    """Replace customers in a sentence by their meters' ids.
+    """Replace customers in a sentence by the names of their meters.
 
     Longer names come first, since one name may be the beginning of another. Inverters keep their customer's
     name, as in alarms.
     """
     meter_of = {
-        site.feeder.customers[int(customer)]: meter
-        for customer, meter in zip(site.meters, site.meter_ids, strict=True)
+        site.feeder.customers[int(customer)]: _meter_name(site, k) for k, customer in enumerate(site.meters)
     }
     names = "|".join(re.escape(name) for name in sorted(meter_of, key=len, reverse=True))
     return re.sub(rf"(?<!\w)(?<!nverter of )(?:{names})(?!\w)", lambda found: meter_of[found[0]], text)
@@ -529,6 +541,7 @@ class MeterState:
     ] = None
     model_only: ModelOnly = False
     clock_offset_s: ClockOffset = None
+    customer: Annotated[str | None, Field(description="Its customer.")] = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -797,6 +810,7 @@ def _meters(
                 v_max_volt=limits.v_max_pu * volt,
                 model_only=bool(model_only[customer]),
                 clock_offset_s=offsets[k],
+                customer=row.customer,
             )
         )
     return tuple(meters)

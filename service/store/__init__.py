@@ -15,10 +15,11 @@ same key again stores it, or finds it stored. After `WriterLost` a store writes 
 """
 
 from service.store.schema import AlarmEvent, OutcomeUnknown, Rejected, StoreUnavailable, WriterLost
-from service.store.store import BAD_READINGS_KEPT, HistoryRules, Store
+from service.store.store import BAD_READINGS_KEPT, AlarmCounts, HistoryRules, Store
 
 __all__ = [
     "BAD_READINGS_KEPT",
+    "AlarmCounts",
     "AlarmEvent",
     "HistoryRules",
     "OutcomeUnknown",

@@ -75,6 +75,14 @@ from service.store.series import (
 from service.store.state_codec import SnapshotKind, StateSnapshot
 
 
+@dataclass(frozen=True, slots=True)
+class AlarmCounts:
+    """Numbers of alarms of one feeder."""
+
+    active: int  # raised or acknowledged
+    raised: int  # active without an acknowledgement
+
+
 class Reader(IncidentReader):
     """Read access to a store. Its connections cannot write."""
 
@@ -154,11 +162,15 @@ class Reader(IncidentReader):
         with self._read() as connection:
             return int(connection.execute(query).scalar_one())
 
-    def raised_by_feeder(self) -> dict[str, int]:
-        """Number of active alarms without an acknowledgement, of the feeders that have any."""
-        query = sa.select(ALARM.c.feeder, sa.func.count()).where(ALARM.c.state == str(AlarmState.RAISED))
+    def alarms_by_feeder(self) -> dict[str, AlarmCounts]:
+        """Number of active alarms of the feeders that have any."""
+        new = sa.func.sum(sa.case((ALARM.c.state == str(AlarmState.RAISED), 1), else_=0))
+        query = sa.select(ALARM.c.feeder, sa.func.count(), new).where(
+            ALARM.c.state.in_([str(AlarmState.RAISED), str(AlarmState.ACKNOWLEDGED)])
+        )
         with self._read() as connection:
-            return {name: int(count) for name, count in connection.execute(query.group_by(ALARM.c.feeder))}
+            rows = connection.execute(query.group_by(ALARM.c.feeder))
+            return {name: AlarmCounts(int(active), int(raised)) for name, active, raised in rows}
 
     def active(self, feeder: str | None = None, *, cleared_since: float | None = None) -> list[Alarm]:
         """Return the alarms that `state_machine.restore` needs.

@@ -1,6 +1,6 @@
 // Alarm list: loaded once, then updated by the event stream; acknowledgements are sent with a name.
 
-import { byId, clock, duration, el, getJson, isKnown, settle, signed, volt } from "./dom.js";
+import { byId, clock, deviceName, duration, el, getJson, isKnown, settle, signed, volt } from "./dom.js";
 import { session } from "./session.js";
 
 const API = "/api/v1/alarms";
@@ -25,6 +25,9 @@ function stalled({ learning = [] }) {
   const more = learning.length > LISTED ? ` and ${learning.length - LISTED} more` : "";
   return `. Meters: ${learning.slice(0, LISTED).map((m) => m.meter).join(", ")}${more}`;
 }
+
+// Device of an alarm: a customer's inverter, a meter, or none for an alarm of the whole feeder.
+const subjectOf = ({ customer, meter, evidence }) => customer ?? deviceName(meter, evidence.customer);
 
 // An error of the feeder's files that explains the accusation as well.
 function hint({ data_error: error }) {
@@ -205,7 +208,7 @@ export class Alarms {
     const numbers = isKnown(e.v_volt_reported) && alarm.kind === "meter-manipulated"
       ? `${volt(e.v_volt_reported)} reported, ${volt(e.v_volt_estimated)} reconstructed (${signed(e.v_volt_reported - e.v_volt_estimated)} V${e.kind ? `, ${e.kind}` : ""})`
       : `${alarm.reason}${stalled(e)}`;
-    const subject = alarm.customer ?? alarm.meter;
+    const subject = subjectOf(alarm);
     const where = subject ? `${subject} · ${alarm.feeder}` : alarm.feeder;
     const since = alarm.state === "cleared"
       ? `${clock(alarm.t_raised)}, cleared after ${duration(alarm.t_cleared - alarm.t_raised)}`
@@ -235,7 +238,7 @@ export class Alarms {
 
   ask(alarm) {
     this.asking = alarm;
-    byId("ack-what").textContent = `${KIND[alarm.kind] ?? alarm.kind}: ${alarm.customer ?? alarm.meter ?? alarm.feeder}. ${alarm.reason}`;
+    byId("ack-what").textContent = `${KIND[alarm.kind] ?? alarm.kind}: ${subjectOf(alarm) || alarm.feeder}. ${alarm.reason}`;
     session.ask("ack-who");
     byId("ack-comment").value = "";
     byId("ack-error").hidden = true;

@@ -6,8 +6,8 @@ import { Incidents } from "./incidents.js";
 import { Commissioning } from "./commissioning.js";
 import { showDetail } from "./detail.js";
 import { Diagram } from "./diagram.js";
-import { bare, busbarWords, byId, clock, duration, el, getJson, isKnown, signed, status } from "./dom.js";
-import { Fleet, worstFirst } from "./fleet.js";
+import { bare, busbarWords, byId, clock, duration, el, getJson, isKnown, signed, status, volt } from "./dom.js";
+import { Fleet } from "./fleet.js";
 import { Series } from "./series.js";
 import { session } from "./session.js";
 
@@ -60,25 +60,22 @@ function around(alarm) {
 
 async function start() {
   await session.begin();
+  const { name, query } = wanted();
   let feeders;
   try {
-    ({ feeders } = await getJson(API));
+    feeders = await fleet.first(name);
   } catch {
     page.linked = false;
     setTimeout(start, 3000);
     return;
   }
-  feeders.sort(worstFirst);
-  byId("feeder").replaceChildren(...feeders.map((f) => el("option", { value: f.name, text: f.title || f.name })));
-  byId("feeder").disabled = feeders.length < 2;
   if (!feeders.length) {
     byId("reason").textContent = "The service monitors no feeder yet.";
     setTimeout(start, 5000);
     return;
   }
-  fleet.begin(feeders);
-  const { name, query } = wanted();
-  const known = feeders.some((f) => f.name === name);
+  fleet.begin();
+  const known = fleet.beside.has(name);
   await show(known ? name : feeders[0].name, known ? query : undefined);
 }
 
@@ -103,7 +100,6 @@ async function show(name, query = new URLSearchParams()) {
   page.heard = null;
   page.past = new Map();
   page.opened = performance.now();
-  byId("feeder").value = name;
   fleet.select(name);
   series.watch(found, again && series.query() ? new URLSearchParams(series.query()) : query);
   address(name);
@@ -120,7 +116,7 @@ async function show(name, query = new URLSearchParams()) {
 // The service responds with the reason why this feeder is not monitored.
 function refused(name, why) {
   Object.assign(page, { feeder: null, report: null, heard: null, past: new Map(), refused: why, linked: true });
-  byId("feeder").value = name;
+  fleet.select(name);
   series.watch(null);
   address(name);
   byId("meters").replaceChildren();
@@ -185,7 +181,7 @@ function verdict() {
   byId("busbar-meter").textContent = report?.busbar?.suspect ? busbarWords(report.busbar) : "";
   if (!report) {
     banner.empty(page.refused ?? "Waiting for the first tick.");
-    title("…");
+    title(page.refused ? "NOT MONITORED" : "NO DATA");
     return;
   }
   const several = diagram.level === null;
@@ -199,6 +195,7 @@ function verdict() {
 // Title of the tab: attacked feeders besides the shown one come first.
 function title(word = page.word) {
   page.word = word;
+  fleet.mark(word);
   const others = page.others ? `${page.others} ATTACKED | ` : "";
   document.title = `${others}${word} – ${page.feeder?.title || page.feeder?.name || ""} – gridsec`;
 }
@@ -299,7 +296,7 @@ function table() {
     const now = status(m, limits, page.report);
     return el("tr", { "data-status": now.key },
       el("th", { scope: "row" }, customer.has(m.meter)
-        ? el("button", { type: "button", class: "plain", text: m.meter, on: { click: () => select(customer.get(m.meter)) } })
+        ? el("button", { type: "button", class: "plain", text: deviceName(m.meter, customer.get(m.meter)), on: { click: () => select(customer.get(m.meter)) } })
         : el("span", { text: m.meter })),
       el("td", { class: "num", text: bare(m.v_volt_reported) }),
       el("td", { class: "num", text: m.model_only && isKnown(m.v_volt_estimated) ? `model ${bare(m.v_volt_estimated)}` : bare(m.v_volt_estimated) }),
@@ -310,7 +307,6 @@ function table() {
   byId("meters").replaceChildren(...rows);
 }
 
-byId("feeder").addEventListener("change", (event) => show(event.target.value));
 byId("detail-series").addEventListener("click", () => {
   const { meter } = page.feeder.layout.customers.find((c) => c.customer === page.selected);
   series.open([meter]);

@@ -1,7 +1,7 @@
 // Status banner: displayed verdict, its start, its certainty, the next step, and all suspects.
 // The displayed verdict changes only after the delays of the alarms; the verdict of the latest tick stands beside it.
 
-import { byId, clock, duration, el, isKnown, signed } from "./dom.js";
+import { byId, clock, deviceName, duration, el, isKnown, signed } from "./dom.js";
 
 const GUIDE = "operator-guide";
 const SHOWN = 8; // Suspects before the button for all.
@@ -147,11 +147,11 @@ export class Banner {
     const accused = new Set([...shown.suspects, ...shown.inverters]);
     const candidates = shown.verdict === "undecided" ? (report.explanations ?? []).flatMap((e) => [...e.meters, ...e.inverters]) : [];
     const every = [
-      ...shown.suspects.map((m) => chip("suspect", `${m}${off(m)}`, () => go(m))),
+      ...shown.suspects.map((m) => chip("suspect", `${deviceName(m, customer.get(m))}${off(m)}`, () => go(m))),
       ...shown.inverters.map((c) => chip("suspect", `inverter of ${c}${kvar(c)}`, () => this.onSelect(c))),
       ...[...new Set(candidates)].filter((one) => !accused.has(one)).map((one) =>
-        chip("doubtful", `candidate ${one}`, () => (customer.has(one) || one === "substation" ? go(one) : this.onSelect(one)))),
-      ...report.silent.map((s) => chip("silent", `${s.meter} silent ${isKnown(s.seconds) ? duration(s.seconds) : ""}`, () => go(s.meter))),
+        chip("doubtful", `candidate ${deviceName(one, customer.get(one))}`, () => (customer.has(one) || one === "substation" ? go(one) : this.onSelect(one)))),
+      ...report.silent.map((s) => chip("silent", `${deviceName(s.meter, customer.get(s.meter))} silent ${isKnown(s.seconds) ? duration(s.seconds) : ""}`, () => go(s.meter))),
     ];
     const rest = every.length - SHOWN;
     const more = rest > 0

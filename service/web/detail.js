@@ -1,6 +1,6 @@
 // One customer: reported and reconstructed voltage, score and threshold, and a trend.
 
-import { bare, byId, clock, duration, el, isKnown, nominals, signed, status, svg, volt } from "./dom.js";
+import { bare, byId, clock, deviceName, duration, el, isKnown, nominals, signed, status, svg, volt } from "./dom.js";
 
 const [W, H, LEFT, RIGHT, TOP, BOTTOM] = [420, 150, 46, 8, 10, 20];
 
@@ -71,10 +71,10 @@ export function showDetail(feeder, customer, { meter, inverter, alone, v, std, o
   const limits = { low: share * feeder.v_min_volt, high: share * feeder.v_max_volt };
   const pu = (value) => (isKnown(value) ? `${(value / nominal).toFixed(4)} pu` : "");
   const now = status(meter, limits, report);
-  byId("detail-title").textContent = customer.customer;
+  byId("detail-title").textContent = deviceName(customer.meter, customer.customer);
   const head = el("p", { class: "where" },
     el("span", { class: "state", "data-status": now.key, text: now.text }),
-    el("span", { class: "quiet", text: ` ${customer.meter ? `meter ${customer.meter}, ` : ""}bus ${customer.bus}${customer.phase ? `, phase ${customer.phase}` : ""}` }));
+    el("span", { class: "quiet", text: ` ${customer.meter ? "" : "no meter, "}bus ${customer.bus}${customer.phase ? `, phase ${customer.phase}` : ""}` }));
   const half = isKnown(std) ? 3 * std : null;
   const list = el("dl", { class: "numbers" });
   if (meter) list.append(...row("Reported", volt(meter.v_volt_reported, 2), pu(meter.v_volt_reported)));

@@ -1,10 +1,17 @@
-// Diagram of the feeder: built once per feeder and width, coloured at every tick.
+// Diagram of the feeder: built once per feeder, window and set of collapsed branches, coloured at every tick.
 
-import { busbarWords, byId, el, isKnown, nominals, signed, status, svg, volt } from "./dom.js";
-import { hasMap, oneLine } from "./layout.js";
+import { busbarWords, byId, deviceName, el, isKnown, nominals, signed, status, svg, volt } from "./dom.js";
+import { placeLabels } from "./labels.js";
+import { hasMap } from "./layout.js";
+import { mapPlaces, onePlaces } from "./places.js";
 import { Scale } from "./scale.js";
+import { Viewport } from "./viewport.js";
 
-const LINE = 12; // Height of a line of a note, px.
+const HOLD_S = 60; // Time for which a branch stays open after its last suspect, s.
+const ROOM = [44, 72]; // Least distance of customers with labels, and of their rows, px.
+const OPENED = 30; // Customers of a branch that open at once; those behind stay collapsed.
+const MARGIN = 34; // Least distance of a visible suspect from the edge of the window, px.
+const PHONE = 620; // Width of a narrow window, px.
 
 // Shapes around (0, 0): the status of a customer must be readable without colour.
 const SHAPE = {
@@ -17,6 +24,8 @@ const SHAPE = {
   high: "M0-10L10 7H-10z",
   low: "M0 10L10-7H-10z",
 };
+const STUB = "M-21-11H21a4 4 0 0 1 4 4V7a4 4 0 0 1-4 4H-21a4 4 0 0 1-4-4V-7a4 4 0 0 1 4-4z";
+const STATION = "M-9-9H9V9H-9zM-9 0H9M0-9V9";
 const SIGN = { suspect: "!", doubtful: "?", silent: "?" };
 // Without the colour of the voltage, which is uncertain here.
 const PLAIN = new Set(["silent", "unjudged", "doubtful"]);
@@ -30,7 +39,9 @@ const LEGEND = [
   ["low", "below limit"],
   ["none", "no meter"],
 ];
+const WORDS = { ok: "consistent", high: "above limit", low: "below limit", doubtful: "doubtful", unjudged: "not monitored", silent: "silent", none: "without a meter" };
 
+// Length of the part that all names begin with, up to a word.
 function sharedPrefix(names) {
   if (names.length < 2) return 0;
   let k = 0;
@@ -39,7 +50,8 @@ function sharedPrefix(names) {
   return k;
 }
 
-const named = ({ customer, phase }) => `${customer}${phase ? `, phase ${phase}` : ""}`;
+const named = ({ meter, customer, phase }) => `${deviceName(meter, customer)}${phase ? `, phase ${phase}` : ""}`;
+const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
 
 export class Diagram {
   constructor({ onSelect }) {
@@ -48,25 +60,31 @@ export class Diagram {
     this.onSelect = onSelect;
     this.scale = new Scale();
     this.view = "line";
-    this.selected = null;
-    this.hovered = null;
-    this.drawn = 0;
+    this.selected = this.hovered = this.waiting = null;
+    this.drawn = "";
+    this.opened = new Set(); // Customers of branches that the operator expanded.
+    this.last = new Map(); // Time of the last tick at which a customer was suspect, Unix s.
+    this.beyond = new Map(); // The same for a voltage beyond the limits.
+    this.viewport = new Viewport(this.box, () => this.moved());
     new ResizeObserver(() => {
-      if (this.feeder && Math.abs(this.box.clientWidth - this.drawn) > 8) this.build();
+      if (this.feeder && this.drawn !== this.window().key) this.build();
     }).observe(this.box);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
       this.scale.theme();
-      if (this.feeder) this.rescale();
+      if (this.feeder) this.scale.draw();
       this.paint();
     });
     for (const button of byId("view").querySelectorAll("button")) {
       button.addEventListener("click", () => this.look(button.dataset.view));
     }
+    const press = { "zoom-in": () => this.viewport.step(1), "zoom-out": () => this.viewport.step(-1), "zoom-reset": () => this.aim(), outside: () => this.aim(), branches: () => this.toggle() };
+    for (const [id, act] of Object.entries(press)) byId(id).addEventListener("click", act);
+    this.box.addEventListener("keydown", (event) => { if (event.key === "0") this.aim(); });
     byId("legend").replaceChildren(...LEGEND.map(([key, text]) => el("li", {},
       svg("svg", { viewBox: "-14 -14 28 28", "aria-hidden": true },
         svg("g", { class: "customer", "data-status": key }, svg("path", { class: "shape", d: SHAPE[key] }),
           svg("text", { class: "sign", y: 5, text: SIGN[key] ?? "" }))),
-      text)));
+      text)), el("li", {}, el("span", { class: "present" }), "range of the present voltages"));
   }
 
   show(feeder) {
@@ -75,22 +93,26 @@ export class Diagram {
     this.nominal = nominals(feeder);
     this.level = new Set(this.nominal.values()).size > 1 ? null : feeder.v_nominal_volt;
     this.report = null;
-    this.placed = oneLine(feeder.layout);
+    this.opened.clear();
+    this.last.clear();
+    this.beyond.clear();
+    this.whole = this.collapsible = false; // All branches are expanded; some collapse.
     this.mapped = hasMap(feeder.layout);
     byId("view").hidden = !this.mapped;
-    this.view = "line";
+    byId("busbar-name").textContent = `Busbar (${feeder.layout.buses[0]})`;
     this.cut = sharedPrefix(feeder.layout.customers.map((c) => c.customer));
-    this.scale.fit([], this.level);
-    this.rescale();
-    this.look("line");
+    const { v_nominal_volt: nominal } = feeder;
+    this.scale.open({ low: this.limits.low / nominal, high: this.limits.high / nominal }, this.level);
+    this.look(this.mapped ? "map" : "line");
   }
 
   clear() {
-    this.feeder = this.report = null;
+    this.feeder = this.report = this.customers = null;
     this.hover(null);
     this.box.replaceChildren();
     byId("scale").replaceChildren();
-    byId("view").hidden = true;
+    byId("busbar-name").textContent = "";
+    for (const id of ["view", "zoom", "outside", "branches"]) byId(id).hidden = true;
   }
 
   look(view) {
@@ -101,13 +123,56 @@ export class Diagram {
     this.build();
   }
 
-  build() {
-    this.drawn = this.box.clientWidth;
+  // Size of the window of the drawing, px.
+  window() {
+    const width = Math.max(280, this.box.clientWidth);
+    const height = Math.round(clamp(innerHeight * 0.56, 300, 680));
+    return { width, height, key: `${width >> 3} ${height >> 4}` };
+  }
+
+  // Customers that never collapse: suspects, until a short time ago, and those that the operator has chosen.
+  // Customers beyond the limits collapse only if the drawing does not fit otherwise.
+  standing() {
+    const now = this.report?.t ?? 0;
+    const names = this.feeder.layout.customers.map(({ customer }) => customer);
+    const recent = (times, name) => Math.abs(now - (times.get(name) ?? -Infinity)) <= HOLD_S;
+    const which = (test) => new Set([...names.keys()].filter((k) => test(names[k])));
+    return {
+      shown: which((name) => this.opened.has(name) || name === this.selected || recent(this.last, name)),
+      beyond: which((name) => recent(this.beyond, name)),
+    };
+  }
+
+  places() {
+    const window = this.window();
+    if (this.view === "map") return mapPlaces(this.feeder.layout, window);
+    return onePlaces(this.feeder.layout, window, { ...this.standing(), whole: this.whole });
+  }
+
+  // Draw again if other branches collapse now.
+  relayout() {
+    if (this.view === "map" || !this.feeder) return;
+    const places = this.places();
+    if (this.signature(places) !== this.signature(this.placed)) this.build(places);
+  }
+
+  signature({ stubs, spots }) {
+    return `${stubs.map((stub) => `${stub.key}:${stub.customers.length}`).join()} ${spots.length}`;
+  }
+
+  // ------------------------------------------------------------- the drawing
+
+  build(places = this.places()) {
+    const focused = this.box.contains(document.activeElement);
+    const window = this.window();
+    this.drawn = window.key;
+    this.placed = places;
     this.lines = [];
     this.customers = new Map();
-    const { root, spots, wires, busbar } = this.view === "map" ? this.mapParts() : this.lineParts();
-    const [casing, layer] = [svg("g", {}), svg("g", {})];
-    for (const wire of wires) {
+    this.stubs = [];
+    const height = Math.round(Math.min(window.height, Math.max(places.world.height, 120)));
+    const [casing, wires, spots] = [svg("g", {}), svg("g", {}), svg("g", {})];
+    for (const wire of places.wires) {
       if (wire.kind === "tie") {
         casing.append(svg("path", { class: "tie", d: wire.d }));
         continue;
@@ -115,144 +180,155 @@ export class Diagram {
       const path = svg("path", { class: `wire ${wire.kind ?? ""}`, d: wire.d });
       this.lines.push({ path, bus: wire.bus });
       casing.append(svg("path", { class: `casing ${wire.kind ?? ""}`, d: wire.d }));
-      layer.append(path);
+      wires.append(path);
     }
-    const names = this.feeder.layout.customers;
-    spots.sort((a, b) => a.order - b.order).forEach((spot, k) => {
-      if (spot.customer === null) return;
-      const customer = names[spot.customer];
-      const shape = svg("path", { class: "shape" });
-      const sign = svg("text", { class: "sign", y: 5 });
-      const note = svg("text", { class: "note", ...spot.note });
-      const group = svg("g", {
-        class: "customer", transform: `translate(${spot.x} ${spot.y}) scale(${spot.size})`, role: "button",
-        "aria-label": `${named(customer)}: no data`,
-        tabindex: k === 0 ? 0 : -1,
-        on: {
-          click: () => this.onSelect(customer.customer),
-          keydown: (event) => this.key(event, customer.customer),
-          pointerenter: (event) => this.hover(event.pointerType === "mouse" ? customer.customer : null),
-          pointerleave: () => this.hover(null),
-          focus: () => this.hover(group.matches(":focus-visible") ? customer.customer : null),
-          blur: () => this.hover(null),
-        },
-      }, svg("circle", { class: "hit", r: 13 }), shape, sign, note);
-      this.customers.set(customer.customer, {
-        customer, group, shape, sign, note, labels: spot.labels, place: spot.note, order: spot.order,
-      });
-      layer.append(group);
+    if (places.station) spots.append(this.symbol({ class: "station", ...places.station }, svg("path", { class: "shape", d: STATION })));
+    this.order = [...places.spots, ...places.stubs].sort((a, b) => a.order - b.order)
+      .map((spot) => (spot.key ? this.stub(spot) : this.spot(spot)));
+    this.order.forEach(({ group }, k) => {
+      group.setAttribute("tabindex", k === 0 ? 0 : -1);
+      spots.append(group);
     });
-    const place = { transform: `translate(${busbar.x} ${busbar.y})` };
-    this.liar = svg("g", { class: "busbar-liar", role: "img", hidden: true, ...place },
-      svg("path", { class: "shape", d: SHAPE.suspect }), svg("text", { class: "sign", y: 5, text: SIGN.suspect }),
-      svg("text", { class: "note", x: 17, y: 4 }));
-    root.append(casing, layer, this.liar);
-    this.box.replaceChildren(root);
+    this.liar = this.symbol({ class: "busbar-liar", role: "img", hidden: true, ...places.busbar },
+      svg("path", { class: "shape", d: SHAPE.suspect }), svg("text", { class: "sign", y: 5, text: SIGN.suspect }), svg("text", { class: "note loud", x: 17, y: 4 }));
+    spots.append(this.liar);
+    this.spots = spots;
+    this.world = svg("g", { class: "world" }, casing, wires, spots);
+    this.root = svg("svg", { width: window.width, height, role: "group", "aria-label": places.title, "aria-describedby": "meters-title" }, this.world);
+    this.box.replaceChildren(this.root);
+    this.box.classList.toggle("map", this.view === "map");
+    byId("zoom").hidden = false;
+    this.viewport.open(places.world, { width: window.width, height });
     this.hover(null);
     this.paint();
+    this.aim();
+    if (focused) this.order[0]?.group.focus();
   }
 
-  lineParts() {
-    const { rows, columns } = this.placed;
-    const width = Math.max(280, this.box.clientWidth);
-    const upright = width < 620 && columns > 8;
-    const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
-    const pad = 26;
-    const along = upright ? 32 : clamp((width - 2 * pad - 10) / columns, 25, 104);
-    const across = upright ? clamp((width - pad - 12) / rows, 62, 120) : clamp(480 / rows, 68, 120);
-    const size = clamp(Math.min(along / 52, across / 76), 1, 1.35);
-    const labels = !upright && along >= 44;
-    const at = (x, row) => (upright
-      ? [pad + row * across, pad + 12 + x * along]
-      : [pad + x * along, pad + 6 + row * across]);
-    const hang = upright ? [28, 0] : [0, 29 * size];
-    const join = (x0, row0, x, row) => {
-      const [ax, ay] = at(x0, row0);
-      const [bx, by] = at(x, row);
-      return upright ? `M${ax} ${ay}H${bx}V${by}` : `M${ax} ${ay}V${by}H${bx}`;
+  // A symbol of constant size on the screen, at a place of the drawing.
+  symbol({ x, y, ...attributes }, ...children) {
+    return svg("g", { transform: `translate(${x} ${y})`, ...attributes }, svg("g", { class: "glyph" }, ...children));
+  }
+
+  spot(spot) {
+    const customer = this.feeder.layout.customers[spot.customer];
+    const [shape, sign, note] = [svg("path", { class: "shape" }), svg("text", { class: "sign", y: 5 }), svg("text", { class: "note" })];
+    const group = this.symbol({ class: "customer", role: "button", "aria-label": `${named(customer)}: no data`, x: spot.x, y: spot.y,
+      on: this.handlers(() => part, () => this.onSelect(customer.customer)) }, svg("circle", { class: "hit", r: 13 }), shape, sign);
+    group.append(svg("g", { class: "still" }, note));
+    const part = { id: customer.customer, customer, group, shape, sign, note, x: spot.x, y: spot.y, said: "" };
+    this.customers.set(customer.customer, part);
+    return part;
+  }
+
+  stub(stub) {
+    const count = svg("text", { class: "count-text", y: 4.5, text: `▸ ${stub.customers.length}` });
+    const group = this.symbol({ class: `stub ${stub.inline ? "inline" : ""}`, role: "button", "aria-expanded": "false", x: stub.x, y: stub.y,
+      on: this.handlers(() => part, () => this.expand(part)) }, svg("path", { class: "shape", d: STUB }), count);
+    const part = { id: stub.key, stub, group, count, shape: group.querySelector(".shape"), x: stub.x, y: stub.y, text: "" };
+    this.stubs.push(part);
+    return part;
+  }
+
+  handlers(part, act) {
+    return {
+      click: act,
+      keydown: (event) => this.key(event, part(), act),
+      pointerenter: (event) => this.hover(event.pointerType === "mouse" ? part() : null),
+      pointerleave: () => this.hover(null),
+      focus: () => {
+        const visible = part().group.matches(":focus-visible");
+        if (visible) this.viewport.reveal(part());
+        this.hover(visible ? part() : null);
+      },
+      blur: () => this.hover(null),
     };
-    const wires = [];
-    for (const line of this.placed.lines) wires.push({ d: join(line.x0, line.row0, line.x, line.row), bus: line.bus });
-    for (const bus of this.placed.buses) {
-      if (bus.to > bus.x) wires.push({ d: join(bus.x, bus.row, bus.to, bus.row), bus: bus.bus });
-      const [x, y] = at(bus.x, bus.row);
-      if (bus.bare) wires.push({ d: upright ? `M${x - 5} ${y}h10` : `M${x} ${y - 5}v10`, bus: bus.bus, kind: "bus" });
-    }
-    const spots = this.placed.customers.map((c) => {
-      const [x, y] = at(c.x, c.row);
-      wires.push({ d: `M${x} ${y}l${hang[0]} ${hang[1]}`, bus: c.bus, kind: "drop" });
-      const note = upright ? { x: 17, y: 4, "text-anchor": "start" } : { x: 0, y: 26, "text-anchor": "middle" };
-      return { customer: c.customer, x: x + hang[0], y: y + hang[1], size, note, labels, order: c.row * 1e4 + c.x };
-    });
-    const places = new Map();
-    for (const b of this.placed.buses) places.set(b.bus, [b.x, b.row, 0]);
-    for (const c of this.placed.customers) if (c.bus !== c.from) places.set(c.bus, [c.x, c.row, 1]);
-    for (const [one, other] of this.feeder.layout.ties ?? []) {
-      // A tie meets the busbar at the row of its other end.
-      const ends = [one, other].map((bus, k) => places.get(bus) ?? [0, places.get(k ? one : other)?.[1] ?? 0, 0]);
-      const [[ax, ay], [bx, by]] = ends.map(([x, row, low]) => {
-        const [px, py] = at(x, row);
-        return [px + low * hang[0], py + low * hang[1]];
-      });
-      // Bent, so that the row of the loop does not hide it.
-      const bend = Math.min(36, 12 + 0.2 * Math.hypot(bx - ax, by - ay));
-      const [mx, my] = [(ax + bx) / 2 - (upright ? bend : 0), (ay + by) / 2 - (upright ? 0 : bend)];
-      wires.push({ d: `M${ax} ${ay}Q${mx} ${my} ${bx} ${by}`, kind: "tie" });
-    }
-    const [x0, y0] = at(0, 0);
-    const [x1, y1] = at(0, rows - 1);
-    wires.push({
-      d: upright ? `M${x0 - 12} ${y0}H${x1 + 12}` : `M${x0} ${y0 - 12}V${y1 + 12}`, bus: 0, kind: "busbar",
-    });
-    const right = at(columns - 1, rows - 1);
-    const extent = upright
-      ? [Math.max(width - 4, right[0] + 78), right[1] + 24]
-      : [Math.max(right[0] + pad, 200), right[1] + (55 + 3 * LINE) * size + 8]; // Drop, note, two lines, a lower one.
-    const root = svg("svg", {
-      width: extent[0], height: extent[1], viewBox: `0 0 ${extent[0]} ${extent[1]}`, role: "group",
-      "aria-label": `One-line diagram, ${this.feeder.layout.customers.length} customers`,
-    }, svg("text", { class: "busbar-name", x: 8, y: 12, text: this.feeder.layout.buses[0] }));
-    this.busbarName = root.firstChild;
-    // Beyond the end of the busbar, where the drawing is empty.
-    return { root, spots, wires, busbar: upright ? { x: x1 + 27, y: y0 } : { x: x0, y: y1 + 27 } };
   }
 
-  mapParts() {
-    const { xy, parent, buses, customers } = this.feeder.layout;
-    const width = Math.max(280, this.box.clientWidth);
-    const [xs, ys] = [xy.map((p) => p[0]), xy.map((p) => p[1])];
-    const span = [Math.max(...xs) - Math.min(...xs) || 1, Math.max(...ys) - Math.min(...ys) || 1];
-    const height = Math.min(680, Math.max(320, (width * span[1]) / span[0]));
-    const pad = 30;
-    const factor = Math.min((width - 2 * pad) / span[0], (height - 2 * pad) / span[1]);
-    const at = (k) => [
-      (width - span[0] * factor) / 2 + (xs[k] - Math.min(...xs)) * factor,
-      height - (height - span[1] * factor) / 2 - (ys[k] - Math.min(...ys)) * factor,
-    ];
-    const wires = buses.slice(1).map((_, i) => {
-      const [ax, ay] = at(parent[i + 1] ?? 0);
-      const [bx, by] = at(i + 1);
-      return { d: `M${ax} ${ay}L${bx} ${by}`, bus: i + 1 };
-    });
-    for (const [one, other] of this.feeder.layout.ties ?? []) {
-      wires.push({ d: `M${at(one).join(" ")}L${at(other).join(" ")}`, kind: "tie" });
-    }
-    const [bx, by] = at(0);
-    wires.push({ d: `M${bx - 9} ${by}h18M${bx} ${by - 9}v18`, bus: 0, kind: "busbar" });
-    const index = new Map(buses.map((id, k) => [id, k]));
-    const here = new Map();
-    const spots = customers.map((c, k) => {
-      const bus = index.get(c.bus) ?? 0;
-      const count = here.get(bus) ?? 0;
-      here.set(bus, count + 1);
-      const [x, y] = at(bus);
-      const note = { x: 0, y: 24, "text-anchor": "middle" };
-      return { customer: k, x: x + 15 * count, y, size: 1, note, labels: false, order: k };
-    });
-    const root = svg("svg", { width, height, viewBox: `0 0 ${width} ${height}`, role: "group", "aria-label": "Map" });
-    this.busbarName = null;
-    return { root, spots, wires, busbar: { x: bx, y: by - 17 } };
+  // ------------------------------------------------------- branches and view
+
+  expand({ stub }) {
+    const names = stub.customers.slice(0, OPENED).map((k) => this.feeder.layout.customers[k].customer);
+    for (const name of names) this.opened.add(name);
+    const { manual } = this.viewport;
+    this.build();
+    this.viewport.manual = manual;
+    const part = this.customers.get(names[0]);
+    part?.group.focus();
+    if (part) this.viewport.reveal(part);
   }
+
+  // Expand all branches, or collapse the quiet ones.
+  toggle() {
+    this.whole = this.placed.stubs.length > 0;
+    this.opened.clear();
+    this.build();
+  }
+
+  // Show the whole drawing; where it would be too small, the suspects.
+  aim() {
+    if (!this.feeder) return;
+    const { viewport, placed: { world } } = this;
+    const loud = this.loud();
+    const all = { x: 0, y: 0, ...world };
+    const whole = Math.min(1, viewport.size.width / world.width, viewport.size.height / world.height);
+    const readable = this.view === "map" ? whole : 0.7;
+    if (whole >= readable || (!loud.length && whole > 0.4)) viewport.fit(all);
+    else if (!loud.length) viewport.fit({ x: 0, y: 0, width: viewport.size.width / 0.5, height: viewport.size.height / 0.5 });
+    else {
+      const [xs, ys] = [loud.map((p) => p.x), loud.map((p) => p.y)];
+      const air = 70;
+      const [x, y] = [Math.min(...xs) - air, Math.min(...ys) - air];
+      viewport.fit({ x, y, width: Math.max(...xs) + air - x, height: Math.max(...ys) + air - y });
+    }
+  }
+
+  // Drawn suspects.
+  loud() {
+    return [...(this.customers?.values() ?? [])].filter((part) => part.key === "suspect");
+  }
+
+  // The view has changed: sizes of the symbols, labels.
+  moved() {
+    const { k, dx, dy } = this.viewport;
+    const { gap, pitch, size } = this.placed;
+    const map = this.view === "map";
+    const [quiet, loud] = map ? [clamp((gap * k) / 20, 0.4, 1), clamp((gap * k) / 20, 0.8, 1)] : [clamp(k * size, 0.5, 1.35), clamp(k * size, 0.75, 1.35)];
+    this.world.setAttribute("transform", `translate(${dx} ${dy}) scale(${k})`);
+    for (const [name, value] of [["--quiet-size", quiet / k], ["--loud-size", loud / k], ["--still", 1 / k]]) this.world.style.setProperty(name, value);
+    this.sizes = { quiet, loud };
+    this.world.classList.toggle("named", gap * k >= ROOM[0] && pitch * k >= ROOM[1] && !this.placed.upright);
+    this.world.classList.toggle("thin", k < 0.6);
+    this.hover(null);
+    this.waiting ??= requestAnimationFrame(() => { this.waiting = null; this.label(); });
+  }
+
+  // Places of labels; suspects outside of the window are counted.
+  label() {
+    if (!this.feeder) return;
+    const { viewport, sizes } = this;
+    const all = this.loud();
+    const seen = all.filter((part) => viewport.holds(part, -MARGIN / 3));
+    const marks = seen.map((part) => ({ ...viewport.at(part), radius: 12 * sizes.loud, lines: part.lines }));
+    const others = [...(this.customers?.values() ?? [])].filter((part) => part.key !== "suspect").map((part) => ({ ...viewport.at(part), radius: 8 * sizes.quiet }));
+    others.push(...this.stubs.map((stub) => ({ ...viewport.at(stub), radius: 11 * sizes.loud, wide: 25 * sizes.loud })));
+    const places = placeLabels(marks, others, viewport.size);
+    seen.forEach(({ note }, k) => {
+      const { x, y, anchor } = places[k];
+      note.setAttribute("text-anchor", anchor);
+      [...note.children].forEach((line, row) => { line.setAttribute("x", x); line.setAttribute("y", y + 13 * row); });
+    });
+    const outside = all.filter((part) => !viewport.holds(part, 4)).length;
+    byId("outside").hidden = outside === 0;
+    byId("outside").textContent = `${outside} suspect${outside === 1 ? "" : "s"} outside of the view: show`;
+    const { stubs } = this.placed;
+    if (stubs.length) this.collapsible = true;
+    byId("branches").hidden = this.view === "map" || !this.collapsible;
+    byId("branches").textContent = stubs.length ? `Expand ${stubs.length} branch${stubs.length === 1 ? "" : "es"}` : "Collapse quiet branches";
+    byId("zoom-out").disabled = viewport.k <= viewport.least * 1.001;
+  }
+
+  // --------------------------------------------------------------- the states
 
   update(report) {
     this.report = report;
@@ -263,14 +339,18 @@ export class Diagram {
     this.phases = new Map(report.buses.map((bus) => [bus.bus, bus.v_phases]));
     const parts = [...this.volts].filter(([bus]) => !this.modelled.has(bus)).map(([bus, v]) => this.part(bus, v)).filter(isKnown);
     parts.push(...report.meters.filter((m) => !m.model_only).map((m) => m.v2_pu_estimated).filter(isKnown).map(Math.sqrt));
-    if (this.scale.fit(parts, this.level)) this.rescale();
+    this.scale.mark(parts);
+    const before = this.loud().length;
+    const accused = new Set((report.inverters ?? []).filter((i) => i.suspect).map((i) => i.customer));
+    for (const customer of this.feeder.layout.customers) {
+      const { key } = status(this.meters.get(customer.meter), this.limits, report);
+      if (key === "suspect" || accused.has(customer.customer)) this.last.set(customer.customer, report.t);
+      if (key === "high" || key === "low") this.beyond.set(customer.customer, report.t);
+    }
+    this.relayout();
     this.paint();
-    this.hover(this.hovered);
-  }
-
-  rescale() {
-    const { v_nominal_volt: nominal } = this.feeder;
-    this.scale.draw({ low: this.limits.low / nominal, high: this.limits.high / nominal });
+    if (this.loud().length !== before && !this.viewport.manual) this.aim();
+    if (this.hovered) this.hover(this.hovered);
   }
 
   // Voltage over the nominal voltage of its bus.
@@ -294,88 +374,139 @@ export class Diagram {
   paint() {
     if (!this.report || !this.customers) return;
     const { buses } = this.feeder.layout;
-    for (const { path, bus } of this.lines) {
-      const color = this.modelled.has(buses[bus]) ? null : this.scale.color(this.part(buses[bus], this.volts.get(buses[bus])));
-      path.classList.toggle("unknown", color === null);
-      path.style.stroke = color ?? "";
+    for (const line of this.lines) {
+      const bus = buses[line.bus];
+      const color = this.modelled.has(bus) ? "" : (this.scale.color(this.part(bus, this.volts.get(bus))) ?? "");
+      if (line.color === color) continue;
+      line.color = color;
+      line.path.classList.toggle("unknown", color === "");
+      line.path.style.stroke = color;
     }
-    let before = null;
-    for (const [id, part] of this.customers) {
-      const meter = this.meters.get(part.customer.meter);
-      const now = status(meter, this.limits, this.report);
-      const v = this.voltAt(part.customer);
-      part.group.setAttribute("data-status", now.key);
-      part.shape.setAttribute("d", SHAPE[now.key]);
-      const alone = this.alone(part.customer);
-      part.shape.style.fill = alone || PLAIN.has(now.key) ? "" : (this.scale.color(this.part(part.customer.bus, v)) ?? "");
-      part.sign.textContent = SIGN[now.key] ?? "";
-      const loud = now.key === "suspect";
-      // Notes of neighbouring suspects must not overlap.
-      const low = loud && !part.labels && before?.loud && !before.low && before.near(part);
-      if (part.place.y > 10) part.note.setAttribute("y", part.place.y + (low ? 2 * LINE : 0));
-      before = { loud, low, near: (other) => other.order - part.order === 1 };
-      part.note.classList.toggle("loud", loud);
-      const whole = id.slice(this.cut);
-      const name = whole.length > 8 ? `${whole.slice(0, 7)}…` : whole;
-      // A suspect keeps its name above its deviation, also where other names have no room.
-      const lines = loud ? [name, signed(meter.attack_volt_estimated)] : [part.labels ? name : ""];
-      const x = part.note.getAttribute("x");
-      part.note.replaceChildren(...lines.map((text, k) => svg("tspan", { x, dy: k ? LINE : null, text })));
-      part.group.setAttribute("aria-label", `${named(part.customer)}: ${now.text}, ${alone ? "model only" : "reconstructed"} ${volt(v)}`);
-      part.group.classList.toggle("selected", id === this.selected);
-    }
+    for (const part of this.customers.values()) this.paintCustomer(part);
+    for (const part of this.stubs) this.paintStub(part);
     const busbar = this.report.busbar ?? {};
-    if (this.busbarName) {
-      const mark = busbar.suspect ? "◆ " : "";
-      this.busbarName.textContent = `${mark}Busbar (${buses[0]}): ${volt(this.volts.get(buses[0]))}${this.modelled.has(buses[0]) ? " (model only)" : ""}`;
-      this.busbarName.classList.toggle("suspect", Boolean(busbar.suspect));
-    }
+    const mark = busbar.suspect ? "◆ " : "";
+    byId("busbar-name").textContent = `${mark}Busbar (${buses[0]}): ${volt(this.volts.get(buses[0]))}${this.modelled.has(buses[0]) ? " (model only)" : ""}`;
+    byId("busbar-name").classList.toggle("suspect", Boolean(busbar.suspect));
     this.liar.toggleAttribute("hidden", !busbar.suspect);
     if (busbar.suspect) {
       this.liar.setAttribute("aria-label", busbarWords(busbar));
       this.liar.querySelector(".note").textContent = signed(busbar.attack_volt_estimated);
     }
+    this.label();
   }
+
+  paintCustomer(part) {
+    const { customer } = part;
+    const meter = this.meters.get(customer.meter);
+    const now = status(meter, this.limits, this.report);
+    const v = this.voltAt(customer);
+    const alone = this.alone(customer);
+    const fill = alone || PLAIN.has(now.key) ? "" : (this.scale.color(this.part(customer.bus, v)) ?? "");
+    const loud = now.key === "suspect";
+    const lines = loud ? [this.short(customer), signed(meter.attack_volt_estimated)] : [this.short(customer)];
+    const text = `${named(customer)}: ${now.text}, ${alone ? "model only" : "reconstructed"} ${volt(v)}`;
+    const said = JSON.stringify([text, fill, lines, customer.customer === this.selected]);
+    if (said === part.said) return; // Unchanged symbols cost nothing.
+    const { key } = part;
+    Object.assign(part, { said, lines, key: now.key });
+    part.group.setAttribute("data-status", now.key);
+    part.shape.setAttribute("d", SHAPE[now.key]);
+    part.shape.style.fill = fill;
+    part.sign.textContent = SIGN[now.key] ?? "";
+    part.note.classList.toggle("loud", loud);
+    const beside = this.view === "map"; // A line mostly goes on below.
+    part.note.setAttribute("text-anchor", beside ? "start" : "middle");
+    part.note.replaceChildren(...lines.map((line, k) => svg("tspan", { x: beside ? 11 : 0, y: (beside ? 4 : 26) + 13 * k, text: line })));
+    part.group.setAttribute("aria-label", text);
+    part.group.classList.toggle("selected", customer.customer === this.selected);
+    // Suspects cover their neighbours.
+    if (loud && key !== "suspect" && document.activeElement !== part.group) this.spots.append(part.group);
+  }
+
+  // Name of a customer in the drawing: the id of its meter.
+  short({ meter, customer }) {
+    const name = meter ?? customer.slice(this.cut);
+    return name.length > 10 ? `${name.slice(0, 9)}…` : name;
+  }
+
+  paintStub(part) {
+    const names = this.feeder.layout.customers;
+    const count = new Map();
+    let [low, high] = [null, null];
+    for (const customer of part.stub.customers.map((k) => names[k])) {
+      const { key } = status(this.meters.get(customer.meter), this.limits, this.report);
+      count.set(key, (count.get(key) ?? 0) + 1);
+      const v = this.alone(customer) ? NaN : this.part(customer.bus, this.voltAt(customer));
+      if (!isKnown(v)) continue;
+      [low, high] = [Math.min(low ?? v, v), Math.max(high ?? v, v)];
+    }
+    const far = low === null ? NaN : Math.abs(low - 1) > Math.abs(high - 1) ? low : high;
+    const color = this.scale.color(far) ?? "";
+    if (part.color !== color) part.shape.style.stroke = part.color = color;
+    const range = low === null ? "no voltage" : `reconstructed ${this.scale.text(low)} to ${this.scale.text(high)}`;
+    const text = [`${part.stub.customers.length} customers`, ...Object.keys(WORDS).filter((key) => count.has(key)).map((key) => `${count.get(key)} ${WORDS[key]}`), range].join(", ");
+    if (part.text === text) return;
+    part.text = text;
+    const worst = ["high", "low", "doubtful", "silent", "unjudged"].find((key) => count.has(key)) ?? "ok";
+    part.group.setAttribute("data-status", worst);
+    part.group.setAttribute("aria-label", `Collapsed branch: ${text}`);
+    part.count.textContent = `▸ ${part.stub.customers.length}${{ ...SIGN, high: "▲", low: "▼" }[worst] ?? ""}`;
+  }
+
+  // ---------------------------------------------------------------- the operator
 
   select(id) {
     this.selected = id;
     this.tip.hidden = true;
+    if (!this.feeder || !this.customers) return;
+    if (id !== null) this.opened.add(id); // The drawing does not change when the panel closes.
+    if (id !== null && !this.customers.has(id)) this.relayout();
     this.paint();
+    if (id !== null && this.customers.has(id)) this.viewport.reveal(this.customers.get(id), 10);
   }
 
-  key(event, id) {
+  key(event, part, act) {
     const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
     if (event.key === "Enter" || event.key === " ") {
       event.preventDefault();
-      this.onSelect(id);
-    } else if (step) {
+      act();
+    } else if (step && !event.shiftKey) {
       event.preventDefault();
-      const ids = [...this.customers.keys()];
-      const next = this.customers.get(ids[(ids.indexOf(id) + step + ids.length) % ids.length]);
-      this.customers.get(id).group.setAttribute("tabindex", -1);
+      const { order } = this;
+      const next = order[(order.indexOf(part) + step + order.length) % order.length];
+      part.group.setAttribute("tabindex", -1);
       next.group.setAttribute("tabindex", 0);
       next.group.focus();
     }
   }
 
-  hover(id) {
-    this.hovered = id;
-    const part = id === null || id === this.selected ? null : this.customers.get(id);
-    this.tip.hidden = !part || !this.report;
+  hover(part) {
+    this.hovered = part;
+    this.tip.hidden = !part || part.id === this.selected || !this.report;
     if (this.tip.hidden) return;
-    const meter = this.meters.get(part.customer.meter);
-    const now = status(meter, this.limits, this.report);
-    this.tip.replaceChildren(
-      el("b", { text: id }),
-      ...(part.customer.phase ? [el("span", { text: `phase ${part.customer.phase}` })] : []),
-      el("span", { class: "state", "data-status": now.key, text: now.text }),
-      el("span", { text: `reported ${volt(meter?.v_volt_reported)}` }),
-      el("span", { text: `${this.alone(part.customer) ? "model only" : "reconstructed"} ${volt(this.voltAt(part.customer))}` }),
-    );
+    this.tip.replaceChildren(...(part.stub ? this.told(part) : this.readings(part.customer)));
     const card = this.tip.parentElement.getBoundingClientRect();
     const spot = part.group.getBoundingClientRect();
-    const left = Math.min(Math.max(spot.left - card.left + spot.width / 2, 90), card.width - 90);
+    const left = clamp(spot.left - card.left + spot.width / 2, 90, card.width - 90);
     this.tip.style.left = `${left}px`;
     this.tip.style.top = `${spot.top - card.top - 8}px`;
+  }
+
+  told({ text }) {
+    const [count, ...rest] = text.split(", ");
+    return [el("b", { text: `Collapsed branch, ${count}` }), ...rest.map((line) => el("span", { text: line }))];
+  }
+
+  readings(customer) {
+    const meter = this.meters.get(customer.meter);
+    const now = status(meter, this.limits, this.report);
+    return [
+      el("b", { text: deviceName(customer.meter, customer.customer) }),
+      ...(customer.phase ? [el("span", { text: `phase ${customer.phase}` })] : []),
+      el("span", { class: "state", "data-status": now.key, text: now.text }),
+      el("span", { text: `reported ${volt(meter?.v_volt_reported)}` }),
+      el("span", { text: `${this.alone(customer) ? "model only" : "reconstructed"} ${volt(this.voltAt(customer))}` }),
+    ];
   }
 }

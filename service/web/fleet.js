@@ -1,108 +1,260 @@
-// All feeders, the worst first: verdict, its duration, suspects, silent meters, alarms. Shown with two feeders or more.
+// All feeders, the worst first: verdict, its duration, suspects, silent meters, alarms. Shown with two feeders or
+// more. The service sorts and filters; the page loads and draws the rows that are visible, whatever their number.
 
 import { byId, duration, el, getJson, isKnown, settle } from "./dom.js";
 import { session } from "./session.js";
 
 const API = "/api/v1/feeders";
 const EVERY_MS = 2000;
+const SHARE = 10; // A request takes at most this part of the time between two of them.
 const SHOWN = 8; // Rows of the short list.
-const MOST = 500; // Rows of the long list; the filter finds the others.
-const WORDS = { attacked: "ATTACKED", undecided: "UNDECIDED", nodata: "NO DATA", unwatched: "NOT MONITORED", clean: "CLEAN" };
-const RANK = Object.keys(WORDS); // Worst first.
+const HEAD = 50; // Feeders in the selector.
+const PAGE = 80; // Rows that are loaded around the visible ones.
+const AROUND = 8; // Rows that are drawn above and below the visible ones.
+const ROW = 33; // Height of a row, px, as in the style sheet.
+const WORDS = { attacked: "ATTACKED", undecided: "UNDECIDED", "no-data": "NO DATA", "not-monitored": "NOT MONITORED", clean: "CLEAN" };
 
-// State of a feeder: its verdict, unless no value uses a present reading.
-export function stateOf(feeder) {
-  if (feeder.phase === "failed") return "unwatched";
-  const stale = isKnown(feeder.age_s) && isKnown(feeder.patience_s) && feeder.age_s > feeder.patience_s;
-  if (!feeder.verdict || feeder.model_only || stale) return "nodata";
-  return feeder.displayed_verdict ?? feeder.verdict;
-}
-
-export const worstFirst = (a, b) => RANK.indexOf(stateOf(a)) - RANK.indexOf(stateOf(b))
-  || b.suspects - a.suspects || b.raised - a.raised || (a.since ?? 0) - (b.since ?? 0) || (a.name < b.name ? -1 : 1);
+const titleOf = (feeder) => feeder.title || feeder.name;
 
 export class Fleet {
   constructor({ onPick, onChange }) {
     this.onPick = onPick;
     this.onChange = onChange; // Called with the number of attacked feeders besides the shown one.
-    this.feeders = [];
+    this.head = []; // The worst feeders.
+    this.beside = new Map(); // Latest entry of every feeder that was loaded last.
+    this.counts = {};
+    this.size = this.total = 0; // Number of feeders, and of those that fit the filters.
+    this.rows = { offset: 0, feeders: [] }; // Loaded part of the long list.
+    this.states = new Set();
     this.selected = null;
-    this.rows = new Map();
-    byId("fleet-all").addEventListener("toggle", () => this.render());
-    byId("fleet-filter").addEventListener("input", () => this.render());
+    this.word = null;
+    this.nodes = new Map();
+    this.turn = 0;
+    byId("fleet-all").addEventListener("toggle", () => this.refresh());
+    byId("fleet-filter").addEventListener("input", () => this.search());
+    byId("fleet-scroll").addEventListener("scroll", () => this.scrolled());
+    byId("fleet-rows").addEventListener("keydown", (event) => this.key(event));
+    byId("feeder").addEventListener("change", (event) => onPick(event.target.value));
   }
 
-  begin(feeders) {
-    this.take(feeders);
-    setInterval(() => this.update(), EVERY_MS);
+  // Load the worst feeders, and a wanted one in any case.
+  async first(wanted) {
+    this.selected = wanted || null;
+    this.take(await getJson(this.query({ limit: HEAD })));
+    return this.head;
   }
 
+  begin() {
+    this.wait(EVERY_MS);
+  }
+
+  wait(time) {
+    setTimeout(async () => this.wait(await this.update()), time);
+  }
+
+  query(parameters) {
+    const query = new URLSearchParams({ order: "worst", ...parameters });
+    if (/^[A-Za-z0-9_-]{1,64}$/.test(this.selected ?? "")) query.set("include", this.selected);
+    return `${API}?${query}`;
+  }
+
+  get long() {
+    return byId("fleet-all").open;
+  }
+
+  // Returns the time until the next request, ms.
   async update() {
-    if (document.visibilityState === "hidden" && this.feeders.length > SHOWN) return;
-    if (this.asking) return;
-    this.asking = true;
+    if (document.visibilityState === "hidden" && this.size > HEAD) return EVERY_MS;
+    const begun = performance.now();
     try {
-      this.take((await getJson(API)).feeders);
+      this.take(await getJson(this.query({ limit: HEAD })));
+      if (this.long) await this.load();
       byId("fleet").dataset.fresh = "yes";
     } catch (error) {
       byId("fleet").dataset.fresh = "no";
       if (error.status === 401) await session.begin();
-    } finally {
-      this.asking = false;
     }
+    return Math.max(EVERY_MS, SHARE * (performance.now() - begun));
   }
 
-  take(feeders) {
-    this.feeders = [...feeders].sort(worstFirst);
+  take({ feeders, counts, total }) {
+    Object.assign(this, { counts, size: total });
+    this.head = feeders.slice(0, Math.min(HEAD, total));
+    this.keep(feeders);
     this.render();
+  }
+
+  keep(feeders) {
+    this.beside = new Map(feeders.map((feeder) => [feeder.name, feeder]));
+  }
+
+  // Part of the long list around the visible rows.
+  async load() {
+    this.turn += 1;
+    const { turn } = this;
+    const offset = Math.max(0, Math.floor(byId("fleet-scroll").scrollTop / ROW) - PAGE / 4);
+    const query = new URL(this.query({ offset, limit: PAGE }), location.href);
+    const text = byId("fleet-filter").value.trim();
+    if (text) query.searchParams.set("text", text);
+    for (const state of this.states) query.searchParams.append("status", state);
+    const { feeders, total } = await getJson(query);
+    if (turn !== this.turn) return; // The response belongs to an earlier place or filter.
+    this.total = total;
+    this.rows = { offset, feeders: feeders.slice(0, Math.min(PAGE, Math.max(0, total - offset))) };
+    this.render();
+  }
+
+  // A filter has changed, or the list was opened or closed.
+  async refresh() {
+    this.rows = { offset: 0, feeders: [] };
+    byId("fleet-scroll").scrollTop = 0;
+    if (this.long) await this.load().catch(() => { byId("fleet").dataset.fresh = "no"; });
+    this.render();
+  }
+
+  filter(state) {
+    if (!this.states.delete(state)) this.states.add(state);
+    this.search();
+  }
+
+  // The short list ends with the first filter.
+  search() {
+    if (this.long) this.refresh();
+    else byId("fleet-all").open = true;
+  }
+
+  scrolled() {
+    if (!this.long) return;
+    this.render();
+    const [first, last] = this.window();
+    const { offset, feeders } = this.rows;
+    if (first < offset || Math.min(last, this.total) > offset + feeders.length) this.load().catch(() => {});
+  }
+
+  // First and last drawn row of the long list.
+  window() {
+    const box = byId("fleet-scroll");
+    const first = Math.floor(box.scrollTop / ROW) - AROUND;
+    return [Math.max(0, first), Math.min(this.total, first + 2 * AROUND + Math.ceil(box.clientHeight / ROW) + 1)];
   }
 
   select(name) {
     this.selected = name;
+    const found = this.beside.get(name) ?? this.rows.feeders.find((feeder) => feeder.name === name);
+    if (found) this.beside.set(name, found);
+    else this.update();
     this.render();
   }
 
+  // Verdict of the shown feeder as in the title of the tab; newer than the list.
+  mark(word) {
+    this.word = word === "…" ? null : word;
+    if (this.word === null) return;
+    const option = [...byId("feeder").options].find((each) => each.value === this.selected);
+    const text = option && `${word} – ${option.dataset.title}`;
+    if (option && option.textContent !== text) option.textContent = text;
+  }
+
   render() {
-    const several = this.feeders.length > 1;
+    const several = this.size > 1;
     byId("fleet").hidden = !several;
-    this.onChange(this.feeders.filter((f) => f.name !== this.selected && stateOf(f) === "attacked").length);
+    const own = this.beside.get(this.selected)?.status === "attacked" ? 1 : 0;
+    this.onChange(Math.max(0, (this.counts.attacked ?? 0) - own));
+    this.selector();
     if (!several) return;
-    const count = new Map(RANK.map((state) => [state, 0]));
-    for (const feeder of this.feeders) count.set(stateOf(feeder), count.get(stateOf(feeder)) + 1);
-    byId("fleet-counts").replaceChildren(...RANK.filter((state) => count.get(state)).map((state) =>
-      el("span", { class: "fleet-state", "data-state": state, text: `${count.get(state)} ${WORDS[state].toLowerCase()}` })));
-    const all = byId("fleet-all").open;
-    const wanted = byId("fleet-filter").value.trim().toLowerCase();
-    const found = all && wanted
-      ? this.feeders.filter((f) => `${f.name} ${f.title}`.toLowerCase().includes(wanted)) : this.feeders;
-    const shown = found.slice(0, all ? MOST : SHOWN);
-    byId("fleet-more").textContent = shown.length < found.length ? `${found.length - shown.length} further feeders` : "";
-    const before = this.rows;
-    this.rows = new Map(shown.map((feeder) => {
-      const said = JSON.stringify([this.cells(feeder), feeder.name === this.selected]);
+    this.tally();
+    const [first, last] = this.long ? this.window() : [0, Math.min(SHOWN, this.head.length)];
+    const { offset, feeders } = this.long ? this.rows : { offset: 0, feeders: this.head };
+    const shown = feeders.slice(Math.max(0, first - offset), Math.max(0, last - offset));
+    const start = Math.max(first, offset);
+    const open = this.long;
+    byId("fleet-more").textContent = open
+      ? `${this.total} of ${this.size}` : this.size > SHOWN ? `${this.size - SHOWN} further feeders` : "";
+    const before = this.nodes;
+    this.nodes = new Map(shown.map((feeder, k) => {
+      const said = JSON.stringify([this.cells(feeder), feeder.name === this.selected, start + k]);
       const old = before.get(feeder.name);
-      return [feeder.name, old?.said === said ? old : { said, node: this.row(feeder) }];
+      return [feeder.name, old?.said === said ? old : { said, node: this.row(feeder, start + k) }];
     }));
-    settle(byId("fleet-rows"), [...this.rows.values()].map(({ node }) => node));
+    byId("fleet-table").setAttribute("aria-rowcount", String((open ? this.total : this.size) + 1));
+    const gap = (rows, key) => {
+      const node = this[key] ??= el("tr", { class: "gap", "aria-hidden": true }, el("td", { colspan: 6 }));
+      node.firstChild.style.height = `${rows * ROW}px`;
+      return rows > 0 ? [node] : [];
+    };
+    const focused = document.activeElement?.closest?.("#fleet-rows tr")?.dataset.feeder;
+    settle(byId("fleet-rows"), [
+      ...gap(open ? start : 0, "above"), ...[...this.nodes.values()].map(({ node }) => node),
+      ...gap(open ? this.total - start - shown.length : 0, "below"),
+    ]);
+    if (focused && document.activeElement === document.body) this.nodes.get(focused)?.node.querySelector("button").focus();
+  }
+
+  // The worst feeders and the shown one, with their verdicts.
+  selector() {
+    const box = byId("feeder");
+    const own = this.beside.get(this.selected);
+    const listed = own && !this.head.includes(own) ? [...this.head, own] : this.head;
+    const before = new Map([...box.options].map((option) => [option.value, option]));
+    const options = listed.map((feeder) => {
+      const option = before.get(feeder.name) ?? el("option", { value: feeder.name });
+      option.dataset.title = titleOf(feeder);
+      const text = `${(feeder.name === this.selected && this.word) || WORDS[feeder.status]} – ${titleOf(feeder)}`;
+      if (option.textContent !== text) option.textContent = text;
+      return option;
+    });
+    const further = this.size - listed.length;
+    if (further > 0) options.push(el("option", { value: "", disabled: true, text: `${further} further feeders: in the list below` }));
+    if (document.activeElement !== box || options.length !== box.options.length) settle(box, options); // An open selector keeps its order.
+    box.disabled = this.size < 2;
+    if (own) box.value = this.selected;
+  }
+
+  // Numbers by verdict: each filters the list.
+  tally() {
+    const states = Object.keys(WORDS).filter((state) => this.counts[state] || this.states.has(state));
+    const before = new Map([...byId("fleet-counts").children].map((node) => [node.dataset.state, node]));
+    settle(byId("fleet-counts"), states.map((state) => {
+      const node = before.get(state) ?? el("button", { type: "button", class: "fleet-state", "data-state": state, title: "Show these only", on: { click: () => this.filter(state) } });
+      const text = `${this.counts[state] ?? 0} ${WORDS[state].toLowerCase()}`;
+      if (node.textContent !== text) node.textContent = text;
+      node.setAttribute("aria-pressed", String(this.states.has(state)));
+      return node;
+    }));
   }
 
   cells(feeder) {
-    const state = stateOf(feeder);
     const begun = feeder.displayed_since ?? feeder.since;
-    const decided = state === (feeder.displayed_verdict ?? feeder.verdict);
-    const since = isKnown(begun) && isKnown(feeder.t) && decided ? duration(feeder.t - begun) : "";
+    const since = isKnown(begun) && isKnown(feeder.t) && feeder.status === (feeder.displayed_verdict ?? feeder.verdict) ? duration(feeder.t - begun) : "";
     const silent = feeder.meters ? `${Math.round((100 * feeder.silent) / feeder.meters)} %` : "";
-    return [state, feeder.title || feeder.name, since, String(feeder.suspects || ""), silent, String(feeder.raised || "")];
+    return [feeder.status, titleOf(feeder), since, String(feeder.suspects || ""), silent, String(feeder.alarms || ""), feeder.raised ? `, ${feeder.raised} new` : ""];
   }
 
-  row(feeder) {
-    const [state, title, since, suspects, silent, raised] = this.cells(feeder);
-    return el("tr", { "data-state": state, "aria-current": feeder.name === this.selected ? "true" : null },
+  row(feeder, k) {
+    const [state, title, since, suspects, silent, alarms, fresh] = this.cells(feeder);
+    return el("tr", { "data-state": state, "data-feeder": feeder.name, "aria-rowindex": k + 2, "aria-current": feeder.name === this.selected ? "true" : null },
       el("td", {}, el("span", { class: "fleet-state", "data-state": state, text: WORDS[state] })),
-      el("th", { scope: "row" }, el("button", { type: "button", class: "plain", text: title, on: { click: () => this.onPick(feeder.name) } })),
+      el("th", { scope: "row" }, el("button", { type: "button", class: "plain", text: title, title, on: { click: () => this.onPick(feeder.name) } })),
       el("td", { class: "num", text: since }),
       el("td", { class: "num", text: suspects }),
       el("td", { class: "num", text: silent }),
-      el("td", { class: "num", text: raised }));
+      el("td", { class: "num" }, alarms, el("span", { class: "fresh", text: fresh })));
+  }
+
+  // Arrow keys walk through all rows, also those that are not loaded yet.
+  async key(event) {
+    const row = event.target.closest("tr[data-feeder]");
+    const last = (this.long ? this.total : Math.min(SHOWN, this.head.length)) - 1;
+    const now = Number(row?.getAttribute("aria-rowindex")) - 2;
+    const next = { ArrowDown: now + 1, ArrowUp: now - 1, Home: 0, End: last }[event.key];
+    if (!row || next === undefined) return;
+    event.preventDefault();
+    const k = Math.min(last, Math.max(0, next));
+    const find = () => byId("fleet-rows").querySelector(`tr[aria-rowindex="${k + 2}"] button`);
+    if (!find()) {
+      byId("fleet-scroll").scrollTop = k * ROW - byId("fleet-scroll").clientHeight / 2;
+      await this.load().catch(() => {});
+    }
+    find()?.focus();
   }
 }

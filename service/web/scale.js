@@ -1,72 +1,99 @@
-// Colour of a voltage: blue is low, orange is high, the middle is the nominal voltage. The range fits the data
-// in few steps, so that the colours rarely change their meaning; its ends are labelled. Voltages are relative
-// to the nominal one, which is null if there are several.
+// Colour of a voltage between the limits of its feeder: blue towards the low limit, orange towards the high one,
+// grey at the nominal voltage; beyond a limit the darkest tone (on a dark page the brightest). The colours keep
+// their meaning, whatever the readings are. Voltages are relative to the nominal one of their bus.
 
-import { bare, byId, el, svg } from "./dom.js";
+import { bare, byId, el, isKnown, svg } from "./dom.js";
 
-const STEPS = [0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.25];
 const STOPS = ["--v-low2", "--v-low1", "--v-mid", "--v-high1", "--v-high2"];
+const BEYOND = ["--v-below", "--v-above"];
+const AIR = 0.08; // Part of the bar beyond each limit.
 
 const parse = (text) => {
   const hex = text.trim().replace("#", "");
   return [0, 2, 4].map((k) => parseInt(hex.slice(k, k + 2), 16));
 };
+const css = (rgb) => `rgb(${rgb.join(",")})`;
 
 export class Scale {
   constructor() {
-    this.nominal = 230;
-    this.range = STEPS[0];
+    this.limits = { low: 0.9, high: 1.1 };
+    this.nominal = null;
+    this.range = [NaN, NaN];
     this.theme();
   }
 
   theme() {
     const style = getComputedStyle(document.documentElement);
-    this.stops = STOPS.map((name) => parse(style.getPropertyValue(name)));
+    [this.stops, this.beyond] = [STOPS, BEYOND].map((names) => names.map((name) => parse(style.getPropertyValue(name))));
   }
 
-  // Returns true if the range changed.
-  fit(parts, nominal) {
-    const largest = Math.max(0, ...parts.map((part) => Math.abs(part - 1)));
-    const needed = STEPS.find((step) => step >= largest) ?? STEPS.at(-1);
-    const keep = this.nominal === nominal && this.range >= needed && largest > 0.55 * needed && this.range <= 2 * needed;
-    const range = keep ? this.range : needed;
-    const changed = range !== this.range || nominal !== this.nominal;
-    this.range = range;
-    this.nominal = nominal;
-    return changed;
+  // Limits relative to the nominal voltage; `nominal`, V, is null if there are several.
+  open(limits, nominal) {
+    Object.assign(this, { limits, nominal, range: [NaN, NaN] });
+    const middle = (limits.low + limits.high) / 2;
+    this.middle = limits.low < 1 && 1 < limits.high ? 1 : middle;
+    this.draw();
+  }
+
+  // Place between the limits: -1 at the low one, 0 in the middle, 1 at the high one.
+  place(part) {
+    const { limits: { low, high }, middle } = this;
+    return part < middle ? (part - middle) / (middle - low) : (part - middle) / (high - middle);
   }
 
   color(part) {
     if (!Number.isFinite(part)) return null;
-    const at = Math.min(1, Math.max(-1, (part - 1) / this.range)) * 2 + 2;
+    const place = this.place(part);
+    if (Math.abs(place) > 1) return css(this.beyond[place < 0 ? 0 : 1]);
+    const at = 2 * place + 2;
     const k = Math.min(3, Math.floor(at));
-    const mix = this.stops[k].map((a, i) => Math.round(a + (this.stops[k + 1][i] - a) * (at - k)));
-    return `rgb(${mix.join(",")})`;
+    return css(this.stops[k].map((a, i) => Math.round(a + (this.stops[k + 1][i] - a) * (at - k))));
   }
 
-  draw(limits) {
-    const { nominal, range } = this;
-    const stops = this.stops.map((c, k) => svg("stop", { offset: `${25 * k}%`, "stop-color": `rgb(${c.join(",")})` }));
+  // Mark the lowest and the highest present voltage.
+  mark(parts) {
+    this.range = parts.length ? [Math.min(...parts), Math.max(...parts)] : [NaN, NaN];
+    const band = byId("scale").querySelector(".present");
+    band.hidden = !this.range.every(Number.isFinite);
+    if (band.hidden) return;
+    const [left, right] = this.range.map((part) => this.left(part));
+    band.style.left = `${left}%`;
+    band.style.width = `${Math.max(right - left, 0.4)}%`;
+    band.title = `present: ${this.text(this.range[0])} to ${this.text(this.range[1])}`;
+  }
+
+  // Place on the bar, %.
+  left(part) {
+    const place = Math.min(1 + 2 * AIR, Math.max(-1 - 2 * AIR, this.place(part)));
+    return 50 + (50 * place) / (1 + 2 * AIR);
+  }
+
+  text(part) {
+    return this.nominal === null ? `${part.toFixed(3)} pu` : `${bare(part * this.nominal)} V`;
+  }
+
+  draw() {
+    const { limits: { low, high }, middle, nominal } = this;
+    const inside = (k) => this.left(k < 2 ? low + (k / 2) * (middle - low) : middle + ((k - 2) / 2) * (high - middle));
+    const stop = (offset, rgb) => svg("stop", { offset: `${offset}%`, "stop-color": css(rgb) });
+    const stops = this.stops.map((rgb, k) => stop(inside(k), rgb));
+    const [below, above] = this.beyond;
     const bar = svg("svg", { class: "bar", "aria-hidden": true, height: 12 },
-      svg("defs", {}, svg("linearGradient", { id: "ramp" }, ...stops)),
+      svg("defs", {}, svg("linearGradient", { id: "ramp" }, stop(0, below), stop(inside(0), below), ...stops, stop(inside(4), above), stop(100, above))),
       svg("rect", { width: "100%", height: 12, rx: 3, fill: "url(#ramp)" }));
-    const marks = [-1, -0.5, 0, 0.5, 1].map((k) => {
-      const pu = 1 + k * range;
-      const part = `${pu.toFixed(range < 0.02 || range === 0.03 || range === 0.075 ? 4 : 3)} pu`;
-      const tick = nominal === null
-        ? el("span", { class: "tick" }, el("b", { text: part }))
-        : el("span", { class: "tick" }, el("b", { text: `${bare(pu * nominal)} V` }), el("span", { text: part }));
-      tick.style.left = `${50 + 50 * k}%`;
-      return tick;
+    const tick = (part, name) => {
+      const found = el("span", { class: "tick" }, el("b", { text: this.text(part) }),
+        el("span", { text: name }), nominal === null ? null : el("span", { class: "pu", text: `, ${part.toFixed(3)} pu` }));
+      found.style.left = `${this.left(part)}%`;
+      return found;
+    };
+    const edges = [["low", low], ["high", high]].map(([name, part]) => {
+      const edge = el("span", { class: `edge ${name}`, title: `${name} limit` });
+      edge.style.left = `${this.left(part)}%`;
+      return edge;
     });
-    const edges = [["low", limits.low], ["high", limits.high]]
-      .map(([name, part]) => [name, (part - 1) / range])
-      .filter(([, place]) => Math.abs(place) <= 1)
-      .map(([name, place]) => {
-        const edge = el("span", { class: `edge ${name}`, title: `${name} limit` });
-        edge.style.left = `${50 + 50 * place}%`;
-        return edge;
-      });
-    byId("scale").replaceChildren(bar, ...edges, el("div", { class: "ticks" }, ...marks));
+    byId("scale").replaceChildren(bar, el("span", { class: "present", hidden: true }), ...edges,
+      el("div", { class: "ticks" }, tick(low, "low limit"), tick(middle, middle === 1 ? "nominal" : "middle"), tick(high, "high limit")));
+    if (this.range.every(isKnown)) this.mark(this.range);
   }
 }

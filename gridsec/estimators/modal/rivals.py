@@ -163,7 +163,7 @@ def replayed(
     return tuple(out)
 
 
-def follow(  # noqa: PLR0917  # the rival, and one tick
+def follow(  # the rival, and one tick
     before: Rival,
     t: float,
     m: Floats,

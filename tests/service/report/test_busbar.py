@@ -96,8 +96,8 @@ def test_it_is_reported_in_volts_and_named_in_words(site: Site) -> None:
     beside = build(site, tick(site, base - 2.3), 2, *said(site, [True], [-2.3], lying=(1, 2)))
     assert beside.suspects == ("m02", "m03", BUSBAR)
     assert beside.reason == (
-        "Manipulated: m02, m03 and the substation's meter; further off than meter accuracy and load "
-        "uncertainty allow. The substation's meter reads 2.3 V (1.0 %) less than the meters of the feeder "
+        "Manipulated: m02 · LV1.101 Load 2, m03 · LV1.101 Load 3 and the substation's meter; further off than "
+        "meter accuracy and load uncertainty allow. The substation's meter reads 2.3 V (1.0 %) less than the meters of the feeder "
         "imply."
     )
     silent = build(site, tick(site, None), 2, *said(site, [True], [6.9]))
@@ -141,7 +141,9 @@ def test_explanations_and_the_monitor_s_own_sentence_name_it_too(site: Site) -> 
     estimate, verdict = said(site, [False], [0.0])
     doubt = replace(verdict, decision=Decision.UNDECIDED, cause=Cause.AMBIGUOUS, explanations=ways)
     found = build(site, tick(site, 231.0), 2, estimate, doubt)
-    assert found.reason == "Several explanations fit: the substation's meter (70%) or else m05 (30%)."
+    assert found.reason == (
+        "Several explanations fit: the substation's meter (70%) or else m05 · LV1.101 Load 5 (30%)."
+    )
     assert [one["meters"] for one in to_json(found)["explanations"]] == [[BUSBAR], ["m05"]]
     told = "The meter of the busbar (phase b) reads 3.0 % more than the meters of the feeder say, and so on."
     for cause in (Cause.AMBIGUOUS, Cause.TOO_FEW_METERS):

@@ -100,22 +100,25 @@ def test_reasons_name_meters_as_alarms_do(site: Site) -> None:
         said = replace(verdict, cause=cause, reason=text, suspects=named, decision=decision)
         return build(site, tick(site, {}, unseen), 2, estimate, said).reason
 
-    assert reason(Cause.RESIDUALS, suspects=(3, 12)).startswith("Manipulated: m04, m13; further off")
-    many = reason(Cause.TOO_MANY_SUSPECTS, suspects=tuple(range(7)))
-    assert many.startswith(
-        "7 meters disagree with the feeder (m01, m02, m03, m04, m05 and 2 more), and at most 2"
+    assert reason(Cause.RESIDUALS, suspects=(3, 12)).startswith(
+        "Manipulated: m04 · LV1.101 Load 4, m13 · LV1.101 Load 13; further off"
     )
-    assert reason(Cause.SILENT_METERS, unseen=(4,)) == "No reading from m05."
+    many = reason(Cause.TOO_MANY_SUSPECTS, suspects=tuple(range(7)))
+    five = ", ".join(f"m0{k} · LV1.101 Load {k}" for k in range(1, 6))
+    assert many.startswith(f"7 meters disagree with the feeder ({five} and 2 more), and at most 2")
+    assert reason(Cause.SILENT_METERS, unseen=(4,)) == "No reading from m05 · LV1.101 Load 5."
     for k, customer in enumerate(customers):  # One customer's name begins another's.
         text = f"The loads are not known well enough to judge {customer}, {customers[0]}."
-        assert reason(Cause.AMBIGUOUS, text).endswith(f" judge {site.meter_ids[k]}, m01.")
+        assert reason(Cause.AMBIGUOUS, text).endswith(
+            f" judge {site.meter_ids[k]} · {customer}, m01 · {customers[0]}."
+        )
     assert reason(Cause.NO_BUSBAR, "as it is") == "as it is"
 
 
-def test_the_monitor_s_own_sentences_name_no_customer(site: Site) -> None:
-    """Whatever the monitor says over a real attack with a gap in it, the operator reads meters' ids."""
+def test_the_monitor_s_own_sentences_name_no_customer_alone(site: Site) -> None:
+    """Whatever the monitor says over a real attack with a gap in it, the operator reads meters' names."""
     attacks = random_attacks(site, 5, "bias", 3, 0.03, t_on=T + 5, t_off=T + 30)
-    names = re.compile("|".join(re.escape(name) for name in site.feeder.customers))
+    names = re.compile("|".join(f"(?<! · ){re.escape(name)}" for name in site.feeder.customers))
     site = choose(site, estimator="exact-bank")
     finished, said = design(site), set()
     state = finished.init(T)
@@ -145,6 +148,7 @@ def test_json_is_plain_and_has_no_nan(site: Site) -> None:
     assert found["explanations"] == []
     wanted = {
         "clock_offset_s",
+        "customer",
         "kind",
         "learning_reason",
         "learning_state",
@@ -213,7 +217,8 @@ def test_a_withheld_power_is_a_reason_with_the_ids_of_meters(site: Site) -> None
     report = build(site, bare, 2, estimate, verdict)
     assert "m01" in report.reason
     assert "unread_std_percent" in report.reason
-    assert not any(customer in report.reason for customer in site.feeder.customers)
+    owners = dict(zip(site.meter_ids, (site.feeder.customers[c] for c in site.meters), strict=True))
+    assert f"m01 · {owners['m01']}" in report.reason
 
 
 def test_kinds_inverters_and_a_standard_deviation_of_its_own(site: Site) -> None:
@@ -237,7 +242,9 @@ def test_kinds_inverters_and_a_standard_deviation_of_its_own(site: Site) -> None
     assert (wrong.customer, wrong.judged, wrong.meter) == (owner, True, "m04")
     assert wrong.attack_kvar_estimated == pytest.approx(-0.1 * site.feeder.base_kva)
     assert wrong.q_kvar_estimated == pytest.approx(0.02 * site.feeder.base_kva)
-    assert report.reason.startswith(f"Manipulated: m04 and the inverter of {owner}; further off")
+    assert report.reason.startswith(
+        f"Manipulated: m04 · LV1.101 Load 4 and the inverter of {owner}; further off"
+    )
 
 
 def test_ambiguity_is_one_sentence_and_a_list(site: Site) -> None:
@@ -260,7 +267,7 @@ def test_ambiguity_is_one_sentence_and_a_list(site: Site) -> None:
     owner = site.feeder.customers[site.droop.customer[1]]
     a, b, c = site.feeder.customers[:3]
     assert report.reason == (
-        f"Several explanations fit: m02 and the reported power of {c} (70%) or else the inverter of {owner} "
+        f"Several explanations fit: m02 · {b} and the reported power of {c} (70%) or else the inverter of {owner} "
         f"(20%) or else the reported powers of {a}, {b} (10%)."
     )
     assert report.explanations == (

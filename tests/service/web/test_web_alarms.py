@@ -393,7 +393,7 @@ def test_meters_that_changed_places_accuse_their_new_customers_on_an_open_page(s
     pairs = zip(site.village.customers, meters, strict=True)
     site.village.customers = [{**c, "meter": meter} for c, meter in pairs]
     site.tick(T0 + 1, lies={"H3": 9.0})
-    expect(suspect).to_have_attribute("aria-label", re.compile("^H9: suspect"))
+    expect(suspect).to_have_attribute("aria-label", re.compile("^H3 · H9: suspect"))
     expect(suspect).to_have_count(1)
     expect(page.locator("#link")).to_have_text("live")
 

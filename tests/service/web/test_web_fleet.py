@@ -16,6 +16,8 @@ from tests.service.looking import DESKTOP, PHONE, Site
 pytestmark = pytest.mark.browser
 
 MANY = 1000
+MOST_ROWS = 60
+"""Largest number of drawn rows of the list."""
 PAINT_S = 15.0
 """Time limit of the first list of 1 000 feeders on a busy machine, s."""
 
@@ -49,7 +51,12 @@ def test_the_worst_feeder_comes_first(
     expect(first.locator("td").nth(3)).to_have_text("0 %")
     # A clean feeder never hides attacked ones.
     expect(page).to_have_title("1 ATTACKED | CLEAN – A-quiet, 4 customers – gridsec")
-    assert page.locator("#feeder option").first.inner_text().startswith("C-attacked")
+    assert page.locator("#feeder option").all_inner_texts() == [
+        "ATTACKED – C-attacked, 4 customers",
+        "UNDECIDED – B-doubtful, 4 customers",
+        "NO DATA – D, 4 customers",
+        "CLEAN – A-quiet, 4 customers",
+    ]
     first.locator("button").click()
     expect(page.locator("#decision")).to_have_text("ATTACKED")
     expect(page).to_have_title("ATTACKED – C-attacked, 4 customers – gridsec")
@@ -75,14 +82,67 @@ def test_a_thousand_feeders_and_the_filter(site_of: Callable[..., Site], village
     for each in villages:
         tick(site, each, T0, lies={"H1": 9.0} if each.name == "v0777" else {})
     begun = time.monotonic()
-    page = site.open(None, "/#v0001")
+    page = site.open(None, "/#v0600")
     expect(page.locator("#fleet-rows tr").first).to_contain_text("V0777")
     assert time.monotonic() - begun < PAINT_S
     expect(page.locator("#fleet-more")).to_have_text(f"{MANY - 8} further feeders")
+    # The selector has the worst feeders and the shown one, with their verdicts.
+    expect(page.locator("#feeder option")).to_have_count(52)
+    assert page.locator("#feeder option").first.inner_text() == "ATTACKED – V0777, 2 customers"
+    expect(page.locator("#feeder option").last).to_be_disabled()
     page.locator("#fleet-all summary").click()
-    expect(page.locator("#fleet-rows tr")).to_have_count(500)
+    expect(page.locator("#fleet-more")).to_have_text(f"{MANY} of {MANY}")
+    assert page.locator("#fleet-rows tr").count() < MOST_ROWS
+    # Any place of the list is reached, by scrolling and by keyboard; the document stays small.
+    page.locator("#fleet-scroll").evaluate("box => { box.scrollTop = 16000; }")
+    expect(page.locator('#fleet-rows tr[data-feeder="v0490"]')).to_be_visible()
+    page.locator('#fleet-rows tr[data-feeder="v0490"] button').focus()
+    page.keyboard.press("ArrowDown")
+    expect(page.locator('#fleet-rows tr[data-feeder="v0491"] button')).to_be_focused()
+    page.keyboard.press("End")
+    expect(page.locator('#fleet-rows tr[data-feeder="v0999"] button')).to_be_focused()
+    expect(page.locator("#fleet-table")).to_have_attribute("aria-rowcount", str(MANY + 1))
+    assert page.locator("#fleet-rows tr").count() < MOST_ROWS
+    page.keyboard.press("Home")
+    expect(page.locator('#fleet-rows tr[data-feeder="v0777"] button')).to_be_focused()
     page.fill("#fleet-filter", "v0999")
     expect(page.locator("#fleet-rows tr")).to_have_count(1)
     page.locator("#fleet-rows button").click()
     expect(page.locator("#verdict")).to_be_visible()
     expect(page.locator("#feeder")).to_have_value("v0999")
+    expect(page).to_have_title("1 ATTACKED | CLEAN – V0999, 2 customers – gridsec")
+    # A feeder that becomes attacked comes to the top within two updates.
+    page.fill("#fleet-filter", "")
+    tick(site, villages[500], T0 + 1.0, lies={"H0": 9.0, "H1": 9.0})
+    expect(page.locator("#fleet-rows tr:not(.gap)").first).to_contain_text("V0500", timeout=10_000)
+    expect(page).to_have_title("2 ATTACKED | CLEAN – V0999, 2 customers – gridsec")
+
+
+def test_numbers_by_verdict_filter_the_list(
+    site_of: Callable[..., Site], village: Callable[..., Any]
+) -> None:
+    villages = [village(name, 4) for name in ("one", "two", "three")]
+    site = site_of(*villages)
+    for k in range(4):
+        tick(site, villages[1], T0 + k, lies={"H1": 9.0, "H2": 9.0})
+    tick(site, villages[2], T0, silent=("H3",))
+    page = site.open(None, "/#one")
+    expect(page.locator("#fleet-rows tr")).to_have_count(3)
+    first, second = page.locator("#fleet-rows tr").nth(0), page.locator("#fleet-rows tr").nth(1)
+    expect(first.locator("td").nth(4)).to_have_text("2, 2 new")
+    expect(second.locator("td").nth(3)).to_have_text("25 %")
+    page.locator('.alarm:has-text("H1") button.ack').click()
+    page.fill("#ack-who", "Ada")
+    page.locator("#ack-form .primary").click()
+    expect(first.locator("td").nth(4)).to_have_text("2, 1 new")
+    page.locator('#fleet-counts button[data-state="undecided"]').click()
+    expect(page.locator("#fleet-rows tr")).to_have_count(1)
+    expect(page.locator("#fleet-rows th")).to_contain_text("Three")
+    expect(page.locator('#fleet-counts button[data-state="undecided"]')).to_have_attribute(
+        "aria-pressed", "true"
+    )
+    page.locator('#fleet-counts button[data-state="undecided"]').click()
+    expect(page.locator("#fleet-rows tr")).to_have_count(3)
+    # A page of another feeder than the shown one: one number of attacked feeders everywhere.
+    expect(page).to_have_title("1 ATTACKED | NO DATA – One, 4 customers – gridsec")
+    expect(page.locator("#feeder option:checked")).to_have_text("NO DATA – One, 4 customers")

@@ -1,0 +1,38 @@
+// Labels of suspects: each stands beside its symbol, at the first place where it covers no symbol and no label;
+// where there is none, no suspect and no label.
+
+const CHARACTER = 7.4; // Width of a bold character at 12 px, px.
+const LINE = 13; // Height of a line, px.
+
+const over = (a, b) => a.x < b.x + b.width && b.x < a.x + a.width && a.y < b.y + b.height && b.y < a.y + a.height;
+
+/* Places of labels in the window. `marks`: point { x, y }, radius, lines of text; in the order of their rank.
+   `others`: points and radii of all other symbols; `wide`: half their width, if larger.
+   Returns for each mark { x, y, anchor } of its first line relative to the point. */
+const square = ({ x, y, radius, wide = radius }) => ({ x: x - wide, y: y - radius, width: 2 * wide, height: 2 * radius });
+
+export function placeLabels(marks, others, { width, height }) {
+  const taken = marks.map(square);
+  const symbols = others.map(square);
+  return marks.map((mark, own) => {
+    const wide = CHARACTER * Math.max(...mark.lines.map((line) => line.length));
+    const tall = LINE * mark.lines.length;
+    const middle = 10 - tall / 2;
+    const [side, below, above] = [mark.radius + 3, mark.radius + 11, -mark.radius - tall + 7];
+    const choices = [
+      { x: 0, y: below, anchor: "middle" },
+      { x: side, y: middle, anchor: "start" },
+      { x: 0, y: above, anchor: "middle" },
+      { x: -side, y: middle, anchor: "end" },
+      ...[1, 2, 3].flatMap((k) => [{ x: 0, y: below + k * tall, anchor: "middle" }, { x: 0, y: above - k * tall, anchor: "middle" }]),
+    ];
+    const box = ({ x, y, anchor }) => ({
+      x: mark.x + x - (anchor === "middle" ? wide / 2 : anchor === "end" ? wide : 0), y: mark.y + y - 11, width: wide, height: tall,
+    });
+    const inside = (b) => b.x >= 0 && b.y >= 0 && b.x + b.width <= width && b.y + b.height <= height;
+    const apart = choices.filter((c) => inside(box(c)) && !taken.some((other, k) => k !== own && over(box(c), other)));
+    const free = apart.find((c) => !symbols.some((other) => over(box(c), other))) ?? apart[0] ?? choices.find((c) => inside(box(c))) ?? choices[0];
+    taken.push(box(free));
+    return free;
+  });
+}
