@@ -30,7 +30,14 @@ from gridsec.estimators.sequential.measurements import nominal_uncertainty
 from gridsec.estimators.sequential.meter_bias import Learning, class_only, learn, no_readings
 from gridsec.estimators.sequential.posterior import condition
 from gridsec.estimators.sequential.search import Limits, false_power_charge, set_cost
-from gridsec.estimators.sequential.time_scales import Scales, chi_square_limit, empty, score_limit, scored
+from gridsec.estimators.sequential.time_scales import (
+    NO_EFFECT,
+    Scales,
+    chi_square_limit,
+    empty,
+    score_limit,
+    scored,
+)
 from gridsec.planning.collusion import Corridor, Shift, corridor, furthest
 from gridsec.planning.unavoidable import AcceptanceRegion, ConeProgram, Faults, deviations
 
@@ -265,7 +272,7 @@ def _scores(design: SequentialDesign, Q: Floats) -> Floats:
     """Scores of the customers' active powers per displacement, standard deviations, (k, p)."""
     columns = design.faults.columns(np.arange(design.customers))[design.prior.meters]
     information = np.einsum("pk,pk->k", columns, Q @ columns)
-    some = information > np.finfo(np.float64).tiny
+    some = information > NO_EFFECT * information.max(initial=0.0)
     return np.asarray((columns[:, some].T @ Q) / np.sqrt(information[some])[:, None])
 
 
