@@ -296,19 +296,25 @@ def load_scores(
     kept: posterior of more meters, if any. Its information is computed once, and is at least that of fewer
     meters.
     """
-    customers = design.customers
     if not scored(design):
         return None
-    full = kept if kept is not None and _contains(kept, now) else now
-    if full.load_information is None:
-        columns = design.faults.columns(np.arange(customers))[design.prior.meters]
-        full.load_information = np.einsum("pk,pk->k", columns, full.Q @ columns)
-    score = design.faults.weighted(loo.weights)[:customers]
-    # A customer at the busbar moves no voltage.
-    information = full.load_information
+    if now.score_rows is None:
+        full = kept if kept is not None and _contains(kept, now) else now
+        if full.score_rows is None:
+            full.score_rows = score_rows(design, full.Q)
+        now.score_rows = full.score_rows
+    return LoadScores(float(np.abs(now.score_rows @ loo.weights).max(initial=0.0)), design.customers)
+
+
+def score_rows(design: SequentialDesign, Q: Floats) -> Floats:
+    """Effects of the powers on the meters over the deviation of honest scores, ``R_k / sqrt(i_k)``, (k, p).
+
+    Customers that move no voltage, at the busbar, are left out. Q: (p, p) precision, zero where not trusted.
+    """
+    columns = design.faults.columns(np.arange(design.customers))[design.prior.meters]
+    information = np.einsum("pk,pk->k", columns, Q @ columns)
     some = information > NO_EFFECT * information.max(initial=0.0)
-    scores = np.abs(score[some]) / np.sqrt(information[some])
-    return LoadScores(float(scores.max(initial=0.0)), customers)
+    return np.asarray(columns[:, some].T / np.sqrt(information[some])[:, None])
 
 
 NO_EFFECT = 1e-12
