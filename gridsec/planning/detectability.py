@@ -38,7 +38,6 @@ from gridsec.estimators.sequential.time_scales import (
     score_rows,
     scored,
 )
-
 from gridsec.planning.collusion import Corridor, Shift, corridor, furthest
 from gridsec.planning.unavoidable import AcceptanceRegion, ConeProgram, Faults, deviations
 
