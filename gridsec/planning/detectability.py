@@ -30,7 +30,14 @@ from gridsec.estimators.sequential.measurements import nominal_uncertainty
 from gridsec.estimators.sequential.meter_bias import Learning, class_only, learn, no_readings
 from gridsec.estimators.sequential.posterior import condition
 from gridsec.estimators.sequential.search import Limits, false_power_charge, set_cost
-from gridsec.estimators.sequential.time_scales import Scales, chi_square_limit, empty, score_limit, scored
+from gridsec.estimators.sequential.time_scales import (
+    Scales,
+    chi_square_limit,
+    empty,
+    score_limit,
+    score_rows,
+    scored,
+)
 from gridsec.planning.collusion import Corridor, Shift, corridor, furthest
 from gridsec.planning.unavoidable import AcceptanceRegion, ConeProgram, Faults, deviations
 
@@ -247,7 +254,9 @@ def acceptance_region(
             error, tail = np.sqrt(model @ np.abs(Q) @ model), design.tails[s]
             if scored(design):
                 tail = 0.5 * tail
-                rows.append(level * _scores(design, Q) / (score_limit(design.customers, tail) + error))
+                rows.append(
+                    level * (score_rows(design, Q) @ Q) / (score_limit(design.customers, tail) + error)
+                )
             root = np.sqrt(chi_square_limit(model.size, tail)) + error
             forms.append(level * np.linalg.cholesky(Q).T / root)
         if busbar:
@@ -259,14 +268,6 @@ def acceptance_region(
     last = scales[len(design.lengths) - 1]
     gain = condition(last.prior, last.noise, every)
     return AcceptanceRegion(np.vstack(rows), tuple(forms), last.prior.covariance @ gain.Q)
-
-
-def _scores(design: SequentialDesign, Q: Floats) -> Floats:
-    """Scores of the customers' active powers per displacement, standard deviations, (k, p)."""
-    columns = design.faults.columns(np.arange(design.customers))[design.prior.meters]
-    information = np.einsum("pk,pk->k", columns, Q @ columns)
-    some = information > np.finfo(np.float64).tiny
-    return np.asarray((columns[:, some].T @ Q) / np.sqrt(information[some])[:, None])
 
 
 def honest_covariance(scales: Scales, ticks: int) -> tuple[Floats, Floats]:

@@ -117,7 +117,9 @@ class Posterior:
         None  # (b,) sums of Q between meters of one busbar phase; None until computed
     )
     variance_sum: float | None = None  # sum of `variance`; None until computed
-    load_information: Floats | None = None  # (N,) ``R_k' Q R_k`` of customers' powers; None until computed
+    score_rows: Floats | None = (
+        None  # (k, p) ``R_k / sqrt(R_k' Q R_k)`` of customers' powers; None until computed
+    )
 
     @property
     def Q(self) -> Floats:  # noqa: N802  # its name in the theory
@@ -183,7 +185,7 @@ class Posterior:
             self.std,
             self.busbar_weights,
             self.variance_sum,
-            self.load_information,
+            self.score_rows,
         )
 
 
@@ -401,7 +403,7 @@ def _update(now: Posterior, update: RankOneUpdate) -> None:
     now.variance -= update.factor * update.spread * update.spread
     np.maximum(now.variance, 0.0, out=now.variance)
     now.updates += 1
-    now.pivot = now.std = now.busbar_weights = now.variance_sum = now.load_information = None
+    now.pivot = now.std = now.busbar_weights = now.variance_sum = now.score_rows = None
 
 
 def updated(now: Posterior, m: Floats, loo: LeaveOneOut, update: RankOneUpdate) -> LeaveOneOut:
@@ -552,7 +554,7 @@ class ExcludedMeters:
         now.variance = np.maximum(now.variance - np.einsum("ij,ij->j", spread, spread), 0.0)
         now.trusted[self.at[order]] = True
         now.updates += r
-        now.pivot = now.std = now.busbar_weights = now.variance_sum = now.load_information = None
+        now.pivot = now.std = now.busbar_weights = now.variance_sum = now.score_rows = None
 
     def _open(self, order: Ints) -> Floats:
         """Posterior covariance between every bus and excluded meters `order`, (n, r)."""

@@ -495,7 +495,7 @@ def _remove_block(here: _Descent, first: int) -> RankOneUpdate | None:
     after = remove_meters(now, removed)
     now.inverse, now.variance, now.updates = after.inverse, after.variance, after.updates
     now.trusted[removed] = False
-    now.pivot = now.std = now.busbar_weights = now.variance_sum = now.load_information = None
+    now.pivot = now.std = now.busbar_weights = now.variance_sum = now.score_rows = None
     return None
 
 

@@ -293,20 +293,38 @@ def load_scores(
 ) -> LoadScores | None:
     """Scores of the residuals of a posterior; None on large feeders.
 
-    kept: posterior of all meters with the same prior, if any. Its information is computed once, and is at
-    least that of fewer meters.
+    kept: posterior of more meters, if any. Its information is computed once, and is at least that of fewer
+    meters.
     """
-    customers = design.customers
     if not scored(design):
         return None
-    full = now if kept is None or kept.prior is not now.prior else kept
-    if full.load_information is None:
-        columns = design.faults.columns(np.arange(customers))[design.prior.meters]
-        full.load_information = np.einsum("pk,pk->k", columns, full.Q @ columns)
-    score = design.faults.weighted(loo.weights)[:customers]
-    # A customer at the busbar moves no voltage.
-    information = np.maximum(full.load_information, np.finfo(np.float64).tiny)
-    return LoadScores(float(np.max(np.abs(score) / np.sqrt(information), initial=0.0)), customers)
+    if now.score_rows is None:
+        full = kept if kept is not None and _contains(kept, now) else now
+        if full.score_rows is None:
+            full.score_rows = score_rows(design, full.Q)
+        now.score_rows = full.score_rows
+    return LoadScores(float(np.abs(now.score_rows @ loo.weights).max(initial=0.0)), design.customers)
+
+
+def score_rows(design: SequentialDesign, Q: Floats) -> Floats:
+    """Effects of the powers on the meters over the deviation of honest scores, ``R_k / sqrt(i_k)``, (k, p).
+
+    Customers that move no voltage, at the busbar, are left out. Q: (p, p) precision, zero where not trusted.
+    """
+    columns = design.faults.columns(np.arange(design.customers))[design.prior.meters]
+    information = np.einsum("pk,pk->k", columns, Q @ columns)
+    some = information > NO_EFFECT * information.max(initial=0.0)
+    return np.asarray(columns[:, some].T / np.sqrt(information[some])[:, None])
+
+
+NO_EFFECT = 1e-12
+"""Information about a power, relative to the largest one, that is rounding."""
+
+
+def _contains(kept: Posterior, now: Posterior) -> bool:
+    """True if a posterior has the prior and the noise of another one, and at least its meters."""
+    same = kept.prior is now.prior and kept.unknowns.shape[1] <= now.unknowns.shape[1]
+    return same and not any_of(now.trusted & ~kept.trusted) and np.array_equal(kept.noise, now.noise)
 
 
 @lru_cache(maxsize=4096)
