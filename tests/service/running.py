@@ -64,7 +64,16 @@ class Outlet:
         assert key == f"{FEEDER}/estimate"
         self.estimates.append(json.loads(payload))
 
-    def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
+    def event(
+        self,
+        key: str,
+        payload: bytes,
+        *,
+        last: bool,
+        number: int,
+        done: Callable[[], None] | None = None,
+    ) -> bool:
+        assert number > 0
         alarm = json.loads(payload)
         assert key == f"{FEEDER}/alarm/{alarm['id']}"
         self.events.append((alarm, last))
