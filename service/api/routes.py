@@ -883,7 +883,8 @@ def list_incidents(  # one argument per query parameter
     shelved: Annotated[bool | None, Query(description="Only shelved ones, or only others.")] = None,
     planned: Annotated[bool | None, Query(description="Only under planned work, or only others.")] = None,
     sort: Annotated[
-        Literal["onset", "severity", "last"], Query(description="Latest, or most severe, first.")
+        Literal["onset", "severity", "last"],
+        Query(description="Latest first; or those to act on first, and of these the most severe."),
     ] = "onset",
     cursor: Cursor = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,

@@ -148,6 +148,8 @@ def test_a_click_survives_news_and_the_search_narrows(site: Site) -> None:
     page.locator(".incident .line").first.focus()
     page.keyboard.press("ArrowDown")
     assert page.evaluate("document.activeElement.closest('.incident').dataset.state") in {"raised", "cleared"}
+    page.locator(".more summary").click()
+    page.select_option("#incident-sort", "onset")
     page.fill("#incident-text", "h5")
     expect(page.locator(".incident")).to_have_count(1)
     expect(line(page)).to_contain_text("H5")
