@@ -189,6 +189,8 @@ GZIP_BYTES = 1000
 """Smallest response that is compressed, bytes."""
 GZIP_LEVEL = 5
 """Level of the compression, 1 to 9."""
+SHIFT_S = 8 * 3600.0
+"""Length of a shift, s: time of the comments of a hand-over."""
 MAX_EVENT = (1 << 63) - 1
 """Largest number of an event."""
 _STATE, _EVENT = TypeAdapter(models.State), TypeAdapter(AlarmEvent)
@@ -1164,11 +1166,14 @@ def get_hand_over(
     backend: BackendHere,
     caller: Caller,
     response: Response,
-    since: Annotated[float, Query(allow_inf_nan=False, description="Begin of the comments, Unix s.")],
+    since: Annotated[
+        float | None, Query(allow_inf_nan=False, description="Begin of the comments; by default 8 h ago.")
+    ] = None,
 ) -> models.HandOver:
     """State of the shift: open incidents, shelves, planned work, and comments since a time."""
     response.headers["Cache-Control"] = "no-store"
     scope, store = _scope(caller), backend.store
+    since = time.time() - SHIFT_S if since is None else since
     open_states = (IncidentState.RAISED, IncidentState.ACKNOWLEDGED)
     return models.HandOver(
         t=time.time(),

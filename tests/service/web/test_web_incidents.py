@@ -96,7 +96,6 @@ def test_pictures_of_incidents_and_hand_over(
     """Two attacked feeders, planned work, a shelf, comments: all are on the page, nothing overflows."""
     site = site_of(village("village"), village("town", 4))
     now = time.time()
-    site.service.wall = lambda: now
     site.tick(now - 300, 4, lies=LIES)
     town = site.service.villages["town"]
     for k in range(4):
