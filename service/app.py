@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import structlog
@@ -35,6 +36,7 @@ from service.notify.targets import Targets, read_targets
 from service.settings import ENV_PREFIX, Settings, SettingsInvalid, is_loopback, split_address
 from service.store import Store
 from service.store.access import AccessStore
+from service.store.committer import missed
 from service.store.deliveries import DeliveryStore
 
 _GRACE_S = 1
@@ -118,6 +120,7 @@ async def serve(
                 max_payload=settings.max_payload,
                 lossless=settings.clock is Clock.EVENTS,
                 wall=wall,
+                missed=partial(missed, store),
             )
         )
         runtime.attach(bus)

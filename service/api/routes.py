@@ -193,6 +193,8 @@ GZIP_BYTES = 1000
 """Smallest response that is compressed, bytes."""
 GZIP_LEVEL = 5
 """Level of the compression, 1 to 9."""
+SHIFT_S = 8 * 3600.0
+"""Length of a shift, s: time of the comments of a hand-over."""
 MAX_EVENT = (1 << 63) - 1
 """Largest number of an event."""
 _STATE, _EVENT = TypeAdapter(models.State), TypeAdapter(AlarmEvent)
@@ -956,7 +958,8 @@ def list_incidents(  # one argument per query parameter
     shelved: Annotated[bool | None, Query(description="Only shelved ones, or only others.")] = None,
     planned: Annotated[bool | None, Query(description="Only under planned work, or only others.")] = None,
     sort: Annotated[
-        Literal["onset", "severity", "last"], Query(description="Latest, or most severe, first.")
+        Literal["onset", "severity", "last"],
+        Query(description="Latest first; or those to act on first, and of these the most severe."),
     ] = "onset",
     cursor: Cursor = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
@@ -1236,11 +1239,14 @@ def get_hand_over(
     backend: BackendHere,
     caller: Caller,
     response: Response,
-    since: Annotated[float, Query(allow_inf_nan=False, description="Begin of the comments, Unix s.")],
+    since: Annotated[
+        float | None, Query(allow_inf_nan=False, description="Begin of the comments; by default 8 h ago.")
+    ] = None,
 ) -> models.HandOver:
     """State of the shift: open incidents, shelves, planned work, and comments since a time."""
     response.headers["Cache-Control"] = "no-store"
     scope, store = _scope(caller), backend.store
+    since = time.time() - SHIFT_S if since is None else since
     open_states = (IncidentState.RAISED, IncidentState.ACKNOWLEDGED)
     return models.HandOver(
         t=time.time(),

@@ -155,11 +155,23 @@ RETRY_S = 1.0
 
 
 class Publication(NamedTuple):
-    """A put, or (without a payload) a deletion, that must not be lost; `done` is called after it."""
+    """A put, or (without a payload) a deletion, that must not be lost; `done` is called after it.
+
+    number: number of the event, its attachment; 0 for none.
+    """
 
     key: str
     payload: bytes | None
     done: Callable[[], None] | None
+    number: int = 0
+
+
+class StoredEvent(NamedTuple):
+    """A stored event for a query: key without the prefix, JSON, number."""
+
+    key: str
+    payload: bytes
+    number: int
 
 
 class Outgoing:

@@ -11,14 +11,24 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from typing import Any
 
 import zenoh
 
+from gridsec.errors import GridsecError
 from service.access.signing import ATTACHMENT_MAX
-from service.ingest.queues import BusConfig, BusCounts, BusUnavailable, Outgoing, Publication, Sample
+from service.ingest.queues import (
+    BusConfig,
+    BusCounts,
+    BusUnavailable,
+    Outgoing,
+    Publication,
+    Sample,
+    StoredEvent,
+)
 
 RING = 8192
 """Capacity of the subscription's queue, samples."""
@@ -28,6 +38,10 @@ _HEAD = 1024
 QUERIES_WAITING = 256
 _ESTIMATES = 1024
 _OPEN_TIMEOUT_MS = 5_000
+MISSED_AT_ONCE = 1000
+"""Largest number of stored events that one query reads."""
+_DIGITS = 18
+"""Largest number of digits of an event's number."""
 JSON = "application/json"
 _MULTICAST = "udp/224.0.0.224:7446"
 """Group of zenoh's multicast scouting."""
@@ -124,6 +138,8 @@ class Bus:
     lossless: under load, block the senders instead of dropping the oldest samples. For `Clock.EVENTS`; in
         real time old data are worthless.
     wall: wall clock, Unix s.
+    missed: called with `alarm` or `incident`, a number and a limit; returns the stored events after the
+        number, oldest first. A GridsecError that it raises is the reply.
     """
 
     def __init__(
@@ -135,8 +151,9 @@ class Bus:
         max_payload: int,
         lossless: bool,
         wall: Callable[[], float] = time.time,
+        missed: Callable[[str, int, int], Iterable[StoredEvent]] = lambda *_: (),
     ) -> None:
-        self._wall = wall
+        self._wall, self._missed = wall, missed
         self._config = config
         self._prefix = prefix
         self._deliver = deliver
@@ -168,7 +185,8 @@ class Bus:
                 key = f"{self._prefix}/*/{kind}"
                 queryable = live.declare_queryable(key, zenoh.handlers.FifoChannel(QUERIES_WAITING))
                 stack.callback(queryable.undeclare)
-                self._start(f"zenoh queries {key}", self._answer, queryable.handler)
+                answer = partial(self._answer, kind.partition("/")[0])
+                self._start(f"zenoh queries {key}", answer, queryable.handler)
             token = live.liveliness().declare_token(f"{self._prefix}/service/{live.zid()}")
             stack.callback(token.undeclare)
             publishing = self._start("zenoh publish", self._publish, live)
@@ -236,12 +254,20 @@ class Bus:
             self._answers[f"{self._prefix}/{key}"] = payload
         self._outgoing.add_telemetry(f"{self._prefix}/{key}", payload)
 
-    def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
+    def event(
+        self,
+        key: str,
+        payload: bytes,
+        *,
+        last: bool,
+        number: int = 0,
+        done: Callable[[], None] | None = None,
+    ) -> bool:
         """Publish an event that must not be lost; in order, with high priority.
 
-        `key` has no prefix; the payload is JSON. With `last` the key is deleted after the put. `done` is
-        called from the publishing thread. Returns False if too many events are waiting; the event is not
-        queued.
+        `key` has no prefix; the payload is JSON, `number` its attachment (0: none). With `last` the key is
+        deleted after the put. `done` is called from the publishing thread. Returns False if too many events
+        are waiting; the event is not queued.
         """
         full = f"{self._prefix}/{key}"
         with self._answers_lock:
@@ -249,8 +275,8 @@ class Bus:
                 self._answers.pop(full, None)
             else:
                 self._answers[full] = payload
-        put = Publication(full, payload, None if last else done)
-        return self._outgoing.add_events(put, *([Publication(full, None, done)] if last else []))
+        put = Publication(full, payload, None if last else done, number)
+        return self._outgoing.add_events(put, *([Publication(full, None, done, number)] if last else []))
 
     def answer(self, key: str, payload: bytes) -> None:
         """Store the reply to queries for a key, without publishing it.
@@ -270,7 +296,7 @@ class Bus:
         while (item := self._outgoing.next()) is not None:
             try:
                 if isinstance(item, Publication):
-                    _put_event(live, item.key, item.payload)
+                    _put_event(live, item)
                 else:
                     key, value = item
                     if key not in publishers:
@@ -300,19 +326,39 @@ class Bus:
 
     # ---------------------------------------------------------------- queries
 
-    def _answer(self, handler: zenoh.handlers.Handler[zenoh.Query]) -> None:
+    def _answer(self, kind: str, handler: zenoh.handlers.Handler[zenoh.Query]) -> None:
         while True:
             try:
                 query = handler.recv()
             except zenoh.ZError:
                 return
             self.counts.queries += 1
-            with self._answers_lock:
-                known = tuple(self._answers.items())
             with query:
+                if kind != "estimate" and query.parameters.get("after") is not None:
+                    self._answer_missed(kind, query)
+                    continue
+                with self._answers_lock:
+                    known = tuple(self._answers.items())
                 for key, payload in known:
                     if query.key_expr.intersects(key) and not _reply(query, key, payload):
                         break
+
+    def _answer_missed(self, kind: str, query: zenoh.Query) -> None:
+        """Reply with the newest event of each key after the number of a query; numbers are attachments."""
+        given = query.parameters.get("after") or ""
+        if not (given.isascii() and given.isdigit() and len(given) <= _DIGITS):
+            _refuse(query, f"after is {given[:40]!r}; expected the number of an event")
+            return
+        try:
+            events = list(self._missed(kind, int(given), MISSED_AT_ONCE))
+        except GridsecError as error:
+            _refuse(query, str(error))
+            return
+        newest = {event.key: event for event in events}
+        for event in sorted(newest.values(), key=lambda event: event.number):
+            key = f"{self._prefix}/{event.key}"
+            if query.key_expr.intersects(key) and not _reply(query, key, event.payload, event.number):
+                return
 
 
 def _well_formed(key: str) -> bool:
@@ -323,24 +369,31 @@ def _well_formed(key: str) -> bool:
     return True
 
 
-def _put_event(live: zenoh.Session, key: str, payload: bytes | None) -> None:
+def _put_event(live: zenoh.Session, item: Publication) -> None:
     options: Mapping[str, Any] = {
         "congestion_control": zenoh.CongestionControl.BLOCK,
         "priority": zenoh.Priority.INTERACTIVE_HIGH,
         "express": True,
+        "attachment": str(item.number) if item.number else None,
     }
-    if payload is None:
-        live.delete(key, **options)
+    if item.payload is None:
+        live.delete(item.key, **options)
     else:
-        live.put(key, payload, encoding=JSON, **options)
+        live.put(item.key, item.payload, encoding=JSON, **options)
 
 
-def _reply(query: zenoh.Query, key: str, payload: bytes) -> bool:
+def _reply(query: zenoh.Query, key: str, payload: bytes, number: int | None = None) -> bool:
+    attachment = None if number is None else str(number)
     try:
-        query.reply(key, payload, encoding=JSON)
+        query.reply(key, payload, encoding=JSON, attachment=attachment)
     except zenoh.ZError:  # the querying session is closed
         return False
     return True
+
+
+def _refuse(query: zenoh.Query, problem: str) -> None:
+    with suppress(zenoh.ZError):  # the querying session is closed
+        query.reply_err(json.dumps({"detail": problem}), encoding=JSON)
 
 
 def _try_recv(handler: zenoh.handlers.Handler[zenoh.Sample]) -> zenoh.Sample | None:

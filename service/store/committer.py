@@ -30,12 +30,13 @@ import structlog
 from service.alarms.incidents import Action, Incident, IncidentEvent, event_json
 from service.alarms.state_machine import Alarm, AlarmTransition, Change, carried
 from service.alarms.state_machine import to_json as alarm_json
-from service.ingest.queues import BusCounts
+from service.ingest.queues import BusCounts, StoredEvent
 from service.metrics import Metrics
 from service.report.report import FeederReport
 from service.store import AlarmEvent, OutcomeUnknown, Rejected, Store, StoreUnavailable
 from service.store.schema import CommissioningEvent
 from service.store.state_codec import SnapshotKind, StateSnapshot
+from service.store.store import Reader
 
 TRANSITIONS_KEPT = 10_000
 """Number of waiting transitions beyond which they are thinned out."""
@@ -213,7 +214,15 @@ class Publisher(Protocol):
     def telemetry(self, key: str, payload: bytes) -> None:
         """Publish the newest value of a key."""
 
-    def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
+    def event(
+        self,
+        key: str,
+        payload: bytes,
+        *,
+        last: bool,
+        number: int,
+        done: Callable[[], None] | None = None,
+    ) -> bool:
         """Publish an event that must not be lost; False if the queue is full."""
 
     def answer(self, key: str, payload: bytes) -> None:
@@ -517,7 +526,8 @@ class Committer:
                 done()
             else:
                 payload = msgspec.json.encode(alarm_json(alarm))
-                if not self.publisher.event(alarm_key(alarm), payload, last=not alarm.active, done=done):
+                key, last = alarm_key(alarm), not alarm.active
+                if not self.publisher.event(key, payload, last=last, number=number, done=done):
                     return
             self._unpublished.popleft()
         while self._incidents:
@@ -528,7 +538,7 @@ class Committer:
             else:
                 payload = msgspec.json.encode(event_json(event))
                 key, last = incident_key(event.incident), not event.incident.open
-                if not self.publisher.event(key, payload, last=last, done=done):
+                if not self.publisher.event(key, payload, last=last, number=event.seq, done=done):
                     return
             self._incidents.popleft()
 
@@ -583,3 +593,20 @@ def incident_key(incident: Incident) -> str:
 def alarm_key(alarm: Alarm) -> str:
     """Return the zenoh key of an alarm, without the prefix."""
     return f"{alarm.feeder}/alarm/{alarm.id}"
+
+
+def missed(store: Reader, kind: str, after: int, limit: int) -> list[StoredEvent]:
+    """Return the stored events after a number for subscribers that missed them, oldest first.
+
+    kind: `alarm` or `incident`, with the keys and payloads of their publication.
+    Raises StoreUnavailable if the database cannot be read.
+    """
+    if kind == "alarm":
+        return [
+            StoredEvent(alarm_key(event.alarm), msgspec.json.encode(alarm_json(event.alarm)), event.seq)
+            for event in store.events_after(after, limit=limit)
+        ]
+    return [
+        StoredEvent(incident_key(event.incident), msgspec.json.encode(event_json(event)), event.seq)
+        for event in store.incident_events_after(after, limit=limit)
+    ]

@@ -327,7 +327,8 @@ class IncidentReader:
         text: restrict to incidents with each of these words, whatever their case.
         assigned_to: restrict to incidents of this person; "" for those of none.
         shelved, planned: restrict to those that are, or are not, shelved or under planned work.
-        sort: `onset` (newest first), `severity` (highest first) or `last` (latest raising first).
+        sort: `onset` (newest first), `severity` (those to act on first, then the highest severity) or `last`
+            (latest raising first).
         cursor, limit: end of the previous page, and length of a page.
         Returns incidents, cursor: the cursor is None on the last page.
         """
@@ -355,7 +356,11 @@ class IncidentReader:
             if given is not None:
                 suppressed = sa.and_(column.is_not(None), open_now)
                 wanted.append(suppressed if given else sa.not_(suppressed))
-        keys = {"onset": None, "severity": rank_of(i.severity), "last": i.t_last}
+        to_do = sa.and_(
+            i.state == str(IncidentState.RAISED), i.shelved_until.is_(None), i.planned_until.is_(None)
+        )
+        worst = rank_of(i.severity) + sa.case((to_do, len(_RANK)), else_=0)
+        keys = {"onset": None, "severity": worst, "last": i.t_last}
         query, key = sorted_by(sa.select(i.id, i.data).where(*wanted), i.id, keys[sort], cursor)
         with self._read() as connection:
             rows = connection.execute(query.limit(limit + 1)).all()

@@ -302,13 +302,13 @@ export class Incidents {
       byId("shift-time").textContent = `at ${clock(found.t, { day: true })}`;
       rows("shift-incidents", found.incidents, (one) => this.summary(one));
       rows("shift-shelves", found.shelves, (one) => el("li", {},
-        el("span", {}, el("b", { text: shelved(one) }), ` until ${clock(one.until, { day: true })}, ${one.who}: `, el("q", { text: one.reason })),
+        el("span", {}, el("b", { text: shelved(one) }), ` until ${clock(one.until)}, ${one.who}: `, el("q", { text: one.reason })),
         this.ending(`${API}/shelves/${one.id}/end`)));
       rows("shift-works", found.planned_work, (one) => el("li", {},
-        el("span", {}, el("b", { text: one.feeder }), ` ${clock(one.t_from, { day: true })} to ${clock(one.t_until, { day: true })}, ${one.who}: `, el("q", { text: one.reason })),
+        el("span", {}, el("b", { text: one.feeder }), ` ${clock(one.t_from)} to ${clock(one.t_until)}, ${one.who}: `, el("q", { text: one.reason })),
         this.ending(`${API}/planned-work/${one.id}/end`)));
       rows("shift-comments", found.comments, (one) => el("li", {},
-        el("span", {}, el("time", { text: clock(one.t, { day: true }) }), ` ${one.feeder}, ${one.who}, ${CHANGE[one.change] ?? one.change}: `, el("q", { text: one.comment }))));
+        el("span", {}, el("time", { text: clock(one.t) }), ` ${one.feeder}, ${one.who}, ${CHANGE[one.change] ?? one.change}: `, el("q", { text: one.comment }))));
     } catch (error) {
       byId("shift-error").textContent = `Not loaded: ${error.message}`;
       byId("shift-error").hidden = false;
@@ -326,7 +326,7 @@ export class Incidents {
     ].filter(Boolean).join(", ");
     return el("li", { "data-severity": one.severity }, el("span", {},
       el("b", { text: `${KIND[one.kind] ?? one.kind}, ${one.severity}` }),
-      ` ${one.feeder}${about ? ` · ${about}` : ""}, ${plural(one.active, "alarm")}, ${notes}, since ${clock(one.t_first, { day: true })}`));
+      ` ${one.feeder}${about ? ` · ${about}` : ""}, ${plural(one.active, "alarm")}, ${notes}, since ${clock(one.t_first)}`));
   }
 
   ending(url) {

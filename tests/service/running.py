@@ -56,6 +56,7 @@ class Outlet:
         self.counts = BusCounts()
         self.estimates: list[dict[str, Any]] = []
         self.events: list[tuple[dict[str, Any], bool]] = []
+        self.incidents: list[tuple[dict[str, Any], bool]] = []
         self.answers: list[str] = []
         self.withdrawn: list[str] = []
         self.confirms = confirms
@@ -64,16 +65,31 @@ class Outlet:
         assert key == f"{FEEDER}/estimate"
         self.estimates.append(json.loads(payload))
 
-    def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
-        alarm = json.loads(payload)
-        assert key == f"{FEEDER}/alarm/{alarm['id']}"
-        self.events.append((alarm, last))
+    def event(
+        self,
+        key: str,
+        payload: bytes,
+        *,
+        last: bool,
+        number: int,
+        done: Callable[[], None] | None = None,
+    ) -> bool:
+        assert number > 0
+        found = json.loads(payload)
+        if "incident" in found:
+            assert key == f"{FEEDER}/incident/{found['incident']['id']}"
+            self.incidents.append((found, last))
+        else:
+            assert key == f"{FEEDER}/alarm/{found['id']}"
+            self.events.append((found, last))
         if self.confirms and done is not None:
             done()
         return True
 
     def answer(self, key: str, payload: bytes) -> None:
-        self.answers.append(f"{key} {json.loads(payload)['id']}")
+        found = json.loads(payload)
+        if "incident" not in found:
+            self.answers.append(f"{key} {found['id']}")
 
     def withdraw(self, key: str) -> None:
         self.withdrawn.append(key)

@@ -143,9 +143,10 @@ def test_unknown_meters_and_feeders_are_refused(setup: Setup) -> None:
 
 def test_head_on_every_get_route(setup: Setup, caplog: pytest.LogCaptureFixture) -> None:
     setup.attack()
-    alarm = setup.one()["id"]
+    alarm = setup.one()
+    ids = {"alarm_id": alarm["id"], "incident_id": alarm["incident"]}
     paths = [
-        path.format(feeder="village", meter="H3", alarm_id=alarm)
+        path.format(feeder="village", meter="H3", **ids)
         for path, methods in setup.get("/openapi.json").json()["paths"].items()
         if "get" in methods
     ]

@@ -263,17 +263,13 @@ def test_the_shift_is_handed_over(attacked: Setup) -> None:
     assert [one["meter"] for one in found["shelves"]] == ["H1"]
     assert [one["feeder"] for one in found["planned_work"]] == ["town"]
     said = [(one["who"], one["change"], one["comment"]) for one in found["comments"]]
-    assert (
-        sorted(said)
-        == [
-            ("Ada", "acknowledged", "Bob drives"),
-            ("Ada", "commented", "seen from the van"),
-            ("Ada", "shelved", "known"),
-        ][: len(said)]
-    )
+    assert sorted(said) == [
+        ("Ada", "acknowledged", "Bob drives"),
+        ("Ada", "commented", "seen from the van"),
+    ]
     assert all(one["incident"] == name for one in found["comments"])
     assert attacked.get("/hand-over", params={"since": T0 + 20}).json()["comments"] == []
-    is_problem(attacked.get("/hand-over"), 422)
+    assert attacked.get("/hand-over").json()["comments"] == found["comments"]
 
 
 def events_by_number_and_by_stream(attacked: Setup) -> None:

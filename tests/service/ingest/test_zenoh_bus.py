@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
 
+from service.alarms.state_machine import AlarmState, AlarmTransition, Change, to_json
 from service.ingest import queues, zenoh_bus
 from service.ingest.queues import BusConfig, BusUnavailable, Sample
 from service.ingest.zenoh_bus import BATCH, RING, Bus, MeterClient
+from service.store import Store
+from service.store.committer import alarm_key, missed
 from tests.codes import refused
 from tests.service.running import free_port, until
+from tests.service.stored import T0, an_alarm, raised
 
 
 class Sink:
@@ -243,11 +251,11 @@ class Refusing:
         self.tries = 0
         put_event = zenoh_bus._put_event
 
-        def put(live: zenoh.Session, key: str, payload: bytes | None) -> None:
-            if self.word is not None and self.word in key:
+        def put(live: zenoh.Session, item: queues.Publication) -> None:
+            if self.word is not None and self.word in item.key:
                 self.tries += 1
                 raise zenoh.ZError("no way out")
-            put_event(live, key, payload)
+            put_event(live, item)
 
         monkeypatch.setattr(zenoh_bus, "_put_event", put)
 
@@ -298,3 +306,55 @@ def test_an_event_without_a_possible_key_holds_up_no_other() -> None:
         bus.event("f/alarm/A", b"a key", last=False, done=lambda: done.append("A"))
         until(lambda: done)
         assert (done, bus.failure, bus.counts.publish_failed) == (["A"], None, 2)
+
+
+def test_a_subscriber_asks_for_what_it_missed(tmp_path: Path) -> None:
+    """It knows the number of the last event, is away for some alarms, and comes back."""
+    end = f"tcp/127.0.0.1:{free_port()}"
+    alarms = [an_alarm(k, feeder=f"town-{k % 2}") for k in range(6)]
+    ended = replace(alarms[4], state=AlarmState.CLEARED, t_cleared=T0 + 60.0)
+    with (
+        Store(f"sqlite:///{tmp_path}/g.db") as store,
+        Bus(
+            BusConfig(listen=(end,)), "gridsec", Sink(), max_payload=1000, lossless=False,
+            missed=partial(missed, store),
+        ) as bus,
+    ):  # fmt: skip
+        with client(end) as first:
+            heard = first.declare_subscriber("gridsec/*/alarm/*", zenoh.handlers.FifoChannel(100))
+            (number,) = store.commit([raised(alarms[0])])
+            time.sleep(0.1)  # the subscription reaches the bus
+            bus.event(alarm_key(alarms[0]), b"alarm", last=False, number=number)
+            sample = heard.handler.recv()
+            last = int(sample.attachment.to_bytes())
+        assert last == number
+        store.commit([raised(each) for each in alarms[1:]])
+        store.commit([AlarmTransition(ended, Change.CLEARED, T0 + 60.0)])
+        with client(end) as second:
+
+            def asked(selector: str) -> list[tuple[int, str, dict[str, Any]]]:
+                replies = [reply.ok for reply in second.get(f"gridsec/{selector}", timeout=10.0)]
+                return sorted(
+                    (int(one.attachment.to_bytes()), str(one.key_expr), json.loads(one.payload.to_bytes()))
+                    for one in replies
+                    if one is not None and one.attachment is not None
+                )
+
+            found = asked(f"*/alarm/*?after={last}")
+            # The newest event of each alarm; number 6 of the fifth one is replaced by its end.
+            assert [each[0] for each in found] == [2, 3, 4, 6, 7]
+            assert found[-1][1] == f"gridsec/town-0/alarm/{ended.id}"
+            assert (found[-1][2]["state"], found[0][2]) == ("cleared", to_json(alarms[1]))
+            assert [each[0] for each in asked(f"town-1/alarm/*?after={last}")] == [2, 4, 6]
+            assert asked("*/alarm/*?after=7") == []
+            incidents = asked("*/incident/*?after=0")
+            assert {each[2]["incident"]["feeder"] for each in incidents} == {"town-0", "town-1"}
+            assert all(each[0] == each[2]["seq"] for each in incidents)
+            for wrong in ("-1", "x", "9" * 30):
+                (refusal,) = second.get(f"gridsec/*/alarm/*?after={wrong}", timeout=10.0)
+                assert refusal.err is not None
+                assert "expected the number" in json.loads(refusal.err.payload.to_bytes())["detail"]
+            (tmp_path / "g.db").rename(tmp_path / "gone.db")
+            (refusal,) = second.get("gridsec/*/alarm/*?after=0", timeout=10.0)
+            assert refusal.err is not None
+            assert "cannot read" in refusal.err.payload.to_string()

@@ -399,6 +399,55 @@ WRITER = """
 """
 
 
+GROUPER = """
+    import sys, time
+    sys.path.insert(0, {tests!r})
+    from dataclasses import replace
+    from service.alarms.state_machine import *
+    from service.store import Store
+    from tests.service.stored import an_alarm, raised
+    store = Store({url!r})
+    number = 1000 * store.last_event
+    while True:
+        number += 100
+        alarms = [an_alarm(number + k, t_event=number + k, t_raised=number + k) for k in range(3)]
+        store.commit([raised(alarm) for alarm in alarms])
+        print(number, flush=True)
+        over = [replace(alarm, state=AlarmState.CLEARED, t_cleared=number + 5.0) for alarm in alarms]
+        store.commit([AlarmTransition(alarm, Change.CLEARED, number + 5.0) for alarm in over])
+        print(number, flush=True)
+"""
+
+
+@pytest.mark.acceptance
+@both
+def test_a_kill_loses_and_doubles_no_incident(url: str) -> None:
+    """Each alarm has one incident with the right numbers; events and states agree; a restart goes on."""
+    code = textwrap.dedent(GROUPER).format(url=url, tests=str(Path.cwd()))
+    for wanted in (1, 4):
+        process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        with process.stdout:
+            for number, _ in enumerate(process.stdout, 1):
+                if number == wanted:
+                    process.send_signal(signal.SIGKILL)
+        assert process.wait(timeout=30) == -signal.SIGKILL
+    with Store(url) as store:
+        alarms = store.alarms(limit=1000)[0]
+        incidents = {one.id: one for one in store.incidents(limit=1000)[0]}
+        assert len(incidents) == len(alarms) / 3 >= 3
+        home = {name: mark.incident for name, mark in store.alarm_marks(one.id for one in alarms).items()}
+        for name, incident in incidents.items():
+            own = [one for one in alarms if home[one.id] == name]
+            assert (incident.alarms, incident.active) == (3, sum(one.active for one in own))
+            events = store.incident_events(name)
+            assert events[-1].incident == incident
+            changes = ["opened"] if incident.open else ["opened", "cleared"]
+            assert [str(event.change) for event in events] == changes
+        numbers = [event.seq for event in store.incident_events_after(0, limit=1000)]
+        assert numbers == sorted(set(numbers))
+
+
 @pytest.mark.canary("postgresql")
 @both
 def test_nothing_acknowledged_is_lost_by_a_kill(url: str, family: str) -> None:

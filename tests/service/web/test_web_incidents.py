@@ -96,7 +96,6 @@ def test_pictures_of_incidents_and_hand_over(
     """Two attacked feeders, planned work, a shelf, comments: all are on the page, nothing overflows."""
     site = site_of(village("village"), village("town", 4))
     now = time.time()
-    site.service.wall = lambda: now
     site.tick(now - 300, 4, lies=LIES)
     town = site.service.villages["town"]
     for k in range(4):
@@ -148,6 +147,8 @@ def test_a_click_survives_news_and_the_search_narrows(site: Site) -> None:
     page.locator(".incident .line").first.focus()
     page.keyboard.press("ArrowDown")
     assert page.evaluate("document.activeElement.closest('.incident').dataset.state") in {"raised", "cleared"}
+    page.locator(".more summary").click()
+    page.select_option("#incident-sort", "onset")
     page.fill("#incident-text", "h5")
     expect(page.locator(".incident")).to_have_count(1)
     expect(line(page)).to_contain_text("H5")
