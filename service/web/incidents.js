@@ -203,9 +203,11 @@ export class Incidents {
       events.length ? el("ol", { class: "log", "aria-label": "Log of the incident" }, ...events.map((event) => this.logged(event))) : null);
   }
 
-  logged({ t, change, who, comment, incident }) {
+  logged(event) {
+    const { t, change, comment, incident } = event;
     const to = change === "assigned" ? ` to ${incident.assigned_to ?? "none"}` : "";
-    return el("li", {}, el("time", { text: clock(t) }), ` ${CHANGE[change] ?? change}${to}${who ? ` by ${who}` : ""}`, comment ? el("q", { text: comment }) : null);
+    const by = event.who ? ` by ${event.who}` : "";
+    return el("li", {}, el("time", { text: clock(t) }), ` ${CHANGE[change] ?? change}${to}${by}`, comment ? el("q", { text: comment }) : null);
   }
 
   // Arrow keys go from incident to incident, letters act on the focused one.
