@@ -119,11 +119,8 @@ def main(runs: int, seed: int) -> int:
     looks = [look for look in map(run, range(seed, seed + runs)) if look is not None]
     right = np.array([bool((each.likeliest == each.liars).all()) for each in looks])
     table(np.array([each.weight for each in looks]), right, "looks")
-    table(
-        np.concatenate([each.marginal for each in looks]),
-        np.concatenate([each.liars for each in looks]),
-        "meters",
-    )
+    marginal = np.concatenate([each.marginal for each in looks])
+    table(marginal, np.concatenate([each.liars for each in looks]), "meters")
     named = sum(bool(each.named.any()) for each in looks)
     honest = sum(bool((each.named & ~each.liars).any()) for each in looks)
     print(f"\n{len(looks)} looks of {runs} runs; a meter is named in {named}, an honest one in {honest}")
