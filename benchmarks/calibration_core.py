@@ -4,9 +4,9 @@
 
 Random trees of 8 to 20 customers, residuals drawn from the model of `gridsec.estimators.modal`, meters of the
 class 0.5 % with a jitter of 0.05 or 0.2 %. After 100 honest ticks, 0 to 4 meters are manipulated, at most a
-third, random or neighbours, with independent amounts, as in the prior of the search, or by one amount; the standard deviation
-is 0.3, 1 or 3 %. In half of the runs two customers switch 1 to 11 kW besides, which no report shows. Five to
-sixty ticks later there is one look, if there is an alarm.
+third, random or neighbours, with independent amounts, as in the prior of the search, or by one amount; their
+standard deviation is 0.3, 1 or 3 %. In half of the runs two customers switch 1 to 11 kW besides, which no
+report shows. Five to sixty ticks later there is one look, if there is an alarm.
 
 First table: the likeliest explanation, by its weight: number of looks, mean weight, and share in which its
 meters are exactly the manipulated ones. Second table: single meters, by the weight of all explanations with
