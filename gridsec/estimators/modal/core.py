@@ -250,7 +250,7 @@ def step(  # noqa: PLR0917  # the state, and one tick
             suspected = replay.carried(made, state.detector.onsets, state.static, pinned)
         suspected = tuple(replay.follow(made, each, update.exact, h) for each in suspected)
     others = tuple(rivals.follow(each, t, m, seen, unknown) for each in state.rivals)
-    if evidence.log_m >= core.limit and (not pinned or (suspected and _elsewhere(evidence, pinned))):
+    if evidence.log_m >= core.limit and (not pinned or _elsewhere(evidence, pinned)):
         test = detector.pin(test, evidence.rows)
         last = replay.record(state.history, (after, known, test, ()), m, seen, unknown)
         others = rivals.replayed(made, core.rivals, last, test.onsets, int(evidence.rows[0]))

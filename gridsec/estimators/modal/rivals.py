@@ -7,8 +7,8 @@ filter since the start of the kept readings, with other errors of the loads:
     w_t = rho w_(t-1) + u_t,   cov u_t = (1 - rho^2) UNREST (1 - c) S + j_t (1 - c) S
 
 with a jump j_t of 0 or of one of `JUMPS` at each tick. The jumps are hypotheses with the prior `RATE` per
-tick. At each tick the likelier one is taken, given the ticks before and theta at its mean. For these jumps the
-filter is exact. With
+tick. At each tick the likelier one is taken, given the ticks before and theta at its mean. For these jumps
+the filter is exact. With
 
     evidence = log prior of the jumps + sum_t log N(nu_t; 0, V_t)
 
@@ -163,7 +163,7 @@ def replayed(
     return tuple(out)
 
 
-def follow(  # the rival, and one tick
+def follow(
     before: Rival,
     t: float,
     m: Floats,
