@@ -108,7 +108,7 @@ class CoreState:
     masked
         Masked meters.
     rivals
-        The model and its rivals since the start of the kept readings, with the likeliest of the pinned onsets.
+        The model and its rivals since the start of the kept readings, with the likeliest pinned onset.
     """
 
     filter: FilterState
@@ -250,7 +250,7 @@ def step(  # noqa: PLR0917  # the state, and one tick
             suspected = replay.carried(made, state.detector.onsets, state.static, pinned)
         suspected = tuple(replay.follow(made, each, update.exact, h) for each in suspected)
     others = tuple(rivals.follow(each, t, m, seen, unknown) for each in state.rivals)
-    if evidence.log_m >= core.limit and (not pinned or (suspected and _elsewhere(evidence, pinned))):
+    if evidence.log_m >= core.limit and (not pinned or _elsewhere(evidence, pinned)):
         test = detector.pin(test, evidence.rows)
         last = replay.record(state.history, (after, known, test, ()), m, seen, unknown)
         others = rivals.replayed(made, core.rivals, last, test.onsets, int(evidence.rows[0]))
@@ -442,9 +442,7 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     now = _joint(core, _parts(state), suspicion.row)
     before, T = [plain], [estimates.moves(made, by, state.filter, now, core.faults.W, core.effect)]
     for each in state.rivals[1:]:
-        assert each.update is not None
-        before.append(
-            estimates.honest(each.modes, by, each.filter, each.static, each.update, loads=each.loads)
-        )
+        update = each.update or state.update
+        before.append(estimates.honest(each.modes, by, each.filter, each.static, update, loads=each.loads))
         T.append(estimates.moves(each.modes, by, each.filter, each.joint(), core.faults.W, core.effect))
     return estimates.corrected(before, T, suspicion.found)

@@ -93,7 +93,7 @@ def estimator(modes: Modes) -> Estimator:
     return Estimator(ratio, by_b @ modes.back, by_e, np.maximum(rest, 0.0), np.maximum(rest_w, 0.0))
 
 
-def honest(  # noqa: PLR0917  # the states of the parts
+def honest(
     modes: Modes,
     made: Estimator,
     state: FilterState,

@@ -201,7 +201,8 @@ def follow(modes: Modes, before: Suspected, innovation: Innovation, h: float) ->
 def freed(modes: Modes, full: Full, joint: Joint, W: Floats, std: Floats) -> Full:
     """The exact filter with the amounts of some faults unknown since the onset; O(t^2 f).
 
-    With y, F and X of these faults, the means lose ``X (F + 1 / s^2)^-1 y`` and P gains ``X (F + 1 / s^2)^-1 X'``.
+    With y, F and X of these faults and ``G = X (F + 1 / s^2)^-1``, the means lose ``G y``, and P gains
+    ``G X'``.
 
     Parameters
     ----------

@@ -1,13 +1,14 @@
 """Rival models of the loads: changes that no report shows, as jumps at some ticks and as unrest.
 
-The filter of `gridsec.estimators.modal.filter` takes the loads' errors as a stationary AR(1). Kettles and cars
-that no report shows, powers that are old and powers that are unread make them jump. A rival is the same filter
-since the start of the kept readings, with other errors of the loads:
+The filter of `gridsec.estimators.modal.filter` takes the loads' errors as a stationary AR(1). Kettles and
+cars that no report shows, powers that are old and powers that are unread make them jump. A rival is the same
+filter since the start of the kept readings, with other errors of the loads:
 
     w_t = rho w_(t-1) + u_t,   cov u_t = (1 - rho^2) UNREST (1 - c) S + j_t (1 - c) S
 
-with a jump j_t of 0 or of one of `JUMPS` at each tick. The jumps are hypotheses with the prior `RATE` per tick.
-At each tick the likelier one is taken, given the ticks before: for these jumps the filter is exact. With
+with a jump j_t of 0 or of one of `JUMPS` at each tick. The jumps are hypotheses with the prior `RATE` per
+tick. At each tick the likelier one is taken, given the ticks before and theta at its mean. For these jumps
+the filter is exact. With
 
     evidence = log prior of the jumps + sum_t log N(nu_t; 0, V_t)
 
@@ -25,15 +26,15 @@ Ghahramani and Hinton, Variational learning for switching state-space models, Ne
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from math import exp, log
 
 import numpy as np
 from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, all_of, indices, submatrix
-from gridsec.estimators.modal import full as exact
 from gridsec.estimators.modal import filter as modal
+from gridsec.estimators.modal import full as exact
 from gridsec.estimators.modal import replay, signatures
 from gridsec.estimators.modal.filter import FilterState, Update
 from gridsec.estimators.modal.model import Modes
@@ -94,9 +95,9 @@ class Rival:
     @property
     def evidence(self) -> float:
         """Logarithm of the prior of the jumps and of the likelihood of the readings, without a fault."""
-        return self.sum + (
-            0.0 if self.filter.full is not None else _of_theta(self.modes, self.static) - self.known
-        )
+        if self.filter.full is not None:
+            return self.sum
+        return self.sum + _of_theta(self.modes, self.static) - self.known
 
     def joint(self) -> Joint:
         """Joint scores of the onset."""
@@ -162,7 +163,7 @@ def replayed(
     return tuple(out)
 
 
-def follow(  # noqa: PLR0917  # the rival, and one tick
+def follow(
     before: Rival,
     t: float,
     m: Floats,
@@ -252,10 +253,10 @@ def _jump(  # noqa: PLR0917  # the states of both parts, and one tick
         nu = m @ modes.U - rho * state.mean[0] - rho_b * state.mean[1]
         if modes.sign.size:
             nu -= (1.0 - rho * g[0] - rho_b * g[1]) * (modes.directions @ known.theta)
-        each = [
-            prior - 0.5 * float((nu**2 / w + np.log(w)).sum())
-            for prior, w in ((q, v + size * varying) for q, size in zip(priors, sizes, strict=True))
-        ]
+        each = []
+        for prior, size in zip(priors, sizes, strict=True):
+            w = v + size * varying
+            each.append(prior - 0.5 * float((nu**2 / w + np.log(w)).sum()))
     else:
         n = np.arange(modes.size) if seen is None else indices(seen)
         if not n.size:

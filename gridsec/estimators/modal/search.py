@@ -57,6 +57,8 @@ SOME = 200
 """Number of sets that are also tried with amounts alike, the cheapest ones first."""
 HOPELESS = 60.0
 """Cost above the best of all from which on a model of the loads is not explored further, 1."""
+NEAR, EXPANDED = 10.0, 6
+"""Cost above the best one up to which the sets beside a set are looked at as well, and their number."""
 FAR = 60.0
 """Cost above the best one, after one change, from which on a set without a meter is not followed, 1."""
 STEPS = 4
@@ -169,11 +171,11 @@ def cost(problem: SearchProblem, chosen: Bools) -> float:
     return out
 
 
-def alike(problem: SearchProblem, sets: Bools) -> Floats:
-    """Costs of some sets if their meters are off by nearly the same amount, (k,); O(n^3) each for n faults.
+def costs(problem: SearchProblem, sets: Bools, share: float = 0.0) -> Floats:
+    """Costs of some sets with a share of the meters' variance in common, (k,); O(n^3) each for n faults.
 
-    The amounts have the prior covariance ``s^2 (ALIKE 1 1' + (1 - ALIKE) I)``. A set bears the largest
-    charge besides: an unreported load moves neighbours alike as well.
+    The amounts have the prior covariance ``s^2 (share 1 1' + (1 - share) I)``. With a share, a set bears the
+    largest charge besides: an unreported load moves neighbours alike as well.
 
     Parameters
     ----------
@@ -181,25 +183,26 @@ def alike(problem: SearchProblem, sets: Bools) -> Floats:
         The problem.
     sets : (k, q)
         The sets.
+    share
+        Share in common, 0 to 1.
     """
     p, (at, inside) = problem.meters, padded(sets)
     std = np.where(inside, problem.std[at], 0.0)
     common = np.where(at < p, std, 0.0)
-    own = np.where(at < p, np.sqrt(1.0 - ALIKE), 1.0) * std
+    own = np.where(at < p, np.sqrt(1.0 - share), 1.0) * std
     # With the common amount as one more fault, the prior is diagonal.
     F, y = problem.F[at[:, :, None], at[:, None, :]], problem.y[at]
     side = np.einsum("kij,kj->ki", F, common)
     n = at.shape[1]
     A = np.empty((len(at), n + 1, n + 1))
     A[:, :n, :n] = own[:, :, None] * F * own[:, None, :]
-    A[:, n, :n] = A[:, :n, n] = np.sqrt(ALIKE) * own * side
-    A[:, n, n] = ALIKE * np.einsum("ki,ki->k", common, side)
+    A[:, n, :n] = A[:, :n, n] = np.sqrt(share) * own * side
+    A[:, n, n] = share * np.einsum("ki,ki->k", common, side)
     A[:, np.arange(n + 1), np.arange(n + 1)] += 1.0
-    pull = np.concatenate([own * y, np.sqrt(ALIKE) * (common * y).sum(axis=1)[:, None]], axis=1)
+    pull = np.concatenate([own * y, np.sqrt(share) * (common * y).sum(axis=1)[:, None]], axis=1)
     log_det, fit = _fits(A, pull)
-    counts = np.count_nonzero(sets[:, :p], axis=1)
-    charge = penalties(p)[counts] + sets @ problem.charge + problem.charge.max(initial=0.0)
-    return np.asarray(charge - fit + log_det)
+    charge = penalties(p)[np.count_nonzero(sets[:, :p], axis=1)] + sets @ problem.charge
+    return np.asarray(charge - fit + log_det + (problem.charge.max(initial=0.0) if share else 0.0))
 
 
 def padded(sets: Bools) -> tuple[Ints, Bools]:
@@ -383,9 +386,8 @@ class Tableau:
         q, p = self.chosen.size, self.problem.meters
         free = inside & ~self.chosen[members]
         count, k = np.count_nonzero(free, axis=1), self.count
-        A = np.where(
-            free[:, :, None] & free[:, None, :], self.A[members[:, :, None], members[:, None, :]], 0.0
-        )
+        both = free[:, :, None] & free[:, None, :]
+        A = np.where(both, self.A[members[:, :, None], members[:, None, :]], 0.0)
         A[:, np.arange(members.shape[1]), np.arange(members.shape[1])] += ~free
         log_det, fit = _fits(A, np.where(free, self.A[members, q], 0.0))
         size = (free * self.size[members]).sum(axis=1)
@@ -572,20 +574,136 @@ def _explored(best: Tableau, groups: tuple[Ints, ...], batches: Groups) -> dict[
         rival.bar(int(j))
         if rival.cost + min(0.0, float(rival.changes().min())) < best.cost + FAR:
             keep(descend(rival, batches))
-    _with_amounts_alike(problem, found)
+    likely = sorted((each, key) for key, each in found.items() if each < best.cost + NEAR)
+    for _, key in likely[: EXPANDED + 1]:
+        if key != best.chosen.tobytes():
+            _neighbours(_at(problem, np.frombuffer(key, dtype=np.bool_)), found)
+    _with_amounts_alike(problem, found, in_common(problem, groups, best.chosen))
     return found
 
 
-def _with_amounts_alike(problem: SearchProblem, found: dict[bytes, float]) -> None:
-    """Mix both priors of the amounts in the cheapest sets with more than one meter."""
+def _with_amounts_alike(problem: SearchProblem, found: dict[bytes, float], more: Bools) -> None:
+    """Mix both priors of the amounts in more sets, and in the cheapest ones with more than one meter."""
+    for chosen, each in zip(more, costs(problem, more), strict=True):
+        found.setdefault(chosen.tobytes(), float(each))
     keys = sorted(found, key=lambda key: found[key])[:SOME]
+    keys = list(dict.fromkeys([*keys, *(each.tobytes() for each in more)]))
     sets = np.stack([np.frombuffer(key, dtype=np.bool_) for key in keys])
     several = np.flatnonzero(np.count_nonzero(sets[:, : problem.meters], axis=1) > 1)
     if several.size:
-        for k, other in zip(several, alike(problem, sets[several]), strict=True):
+        for k, other in zip(several, costs(problem, sets[several], ALIKE), strict=True):
             # Twice the logarithm of the mean of both likelihoods.
             both = np.logaddexp(-0.5 * found[keys[k]], -0.5 * other)
             found[keys[k]] = 2.0 * (log(2.0) - float(both))
+
+
+class Common:
+    """A set of meters that are off by one amount, and the costs of all sets near it.
+
+    The scores and the information of the one amount are ``a = 1' y_J`` and ``b = 1' F_JJ 1``:
+
+        cost(J) = -a^2 / (b + 1 / s^2) + log(1 + s^2 b) + penalty(J)
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    groups : (g, p)
+        Members of the groups.
+    inside : (p,)
+        The set.
+    """
+
+    def __init__(self, problem: SearchProblem, groups: Floats, inside: Bools) -> None:
+        p = problem.meters
+        self.y, self.F, self.s2 = problem.y[:p], problem.F[:p, :p], float(problem.std[0]) ** 2
+        self.penalty, self.groups, self.most = penalties(p), groups, p // 2
+        self.inside = inside.copy()
+        self._set()
+
+    def _set(self) -> None:
+        self.rows = self.F @ self.inside
+        self.a, self.b = float(self.y @ self.inside), float(self.rows @ self.inside)
+        self.count = int(self.inside.sum())
+
+    def _costs(self, a: Floats, b: Floats, count: Ints) -> Floats:
+        good = (count > 0) & (count <= self.most)
+        b = np.maximum(b, 0.0)
+        out = -a * a / (b + 1.0 / self.s2) + np.log1p(self.s2 * b) + self.penalty[np.where(good, count, 0)]
+        return np.where(good, out, inf)
+
+    @property
+    def cost(self) -> float:
+        """Cost of the set."""
+        return float(self._costs(np.array([self.a]), np.array([self.b]), np.array([self.count]))[0])
+
+    def toggled(self) -> Floats:
+        """Cost after toggling each meter, (p,)."""
+        sign = np.where(self.inside, -1.0, 1.0)
+        b = self.b + 2.0 * sign * self.rows + self.F.diagonal()
+        return self._costs(self.a + sign * self.y, b, self.count + np.where(self.inside, -1, 1))
+
+    def grouped(self) -> Floats:
+        """Cost after adding the rest of each group, and after removing each group, (2, g)."""
+        out = []
+        for sign, free in ((1.0, ~self.inside), (-1.0, self.inside)):
+            some = self.groups * free
+            b = self.b + 2.0 * sign * (some @ self.rows) + ((some @ self.F) * some).sum(axis=1)
+            count = self.count + (sign * some.sum(axis=1)).astype(np.intp)
+            out.append(self._costs(self.a + sign * (some @ self.y), b, count))
+        return np.stack(out)
+
+    def descend(self) -> Common:
+        """Lower the cost by meters and groups until none of them helps."""
+        for _ in range(4 * self.inside.size):
+            one, some = self.toggled(), self.grouped()
+            j = int(one.argmin())
+            if min(one[j], some.min(initial=inf)) >= self.cost - _GAIN:
+                break
+            if one[j] <= some.min(initial=inf):
+                self.inside[j] = not self.inside[j]
+            else:
+                remove, g = np.unravel_index(int(some.argmin()), some.shape)
+                self.inside[self.groups[g] > 0.0] = not remove
+            self._set()
+        return self
+
+
+def in_common(problem: SearchProblem, groups: tuple[Ints, ...], best: Bools) -> Bools:
+    """Sets of meters that are off by nearly one amount, with those that differ by one meter, (k, q).
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    groups
+        Groups of neighbours.
+    best : (q,)
+        The best set with independent amounts.
+    """
+    p, out = problem.meters, dict[bytes, Bools]()
+    members = np.zeros((len(groups), p))
+    for k, each in enumerate(groups):
+        members[k, each] = 1.0
+    none = np.zeros(p, dtype=np.bool_)
+    starts = [best[:p]] if best[:p].any() else []
+    if groups:
+        first = Common(problem, members, none).grouped()[0]
+        starts += [members[k] > 0.0 for k in np.argsort(first, kind="stable")[:_COMMON]]
+    for start in starts:
+        end = Common(problem, members, start).descend()
+        near = end.toggled() < end.cost - 2.0 * log(BELIEVED)
+        for j in (-1, *np.flatnonzero(near)):
+            chosen = np.zeros(problem.y.size, dtype=np.bool_)
+            chosen[:p] = end.inside
+            if j >= 0:
+                chosen[j] = not chosen[j]
+            out[chosen.tobytes()] = chosen
+    return np.stack(list(out.values())) if out else np.zeros((0, problem.y.size), dtype=np.bool_)
+
+
+_COMMON = 4
+"""Number of groups from which a descent with one amount starts: the cheapest ones."""
 
 
 def _best(starts: tuple[Tableau, ...], groups: Groups) -> Tableau:
@@ -631,7 +749,7 @@ _FLIPS = 4
 
 def _neighbours(best: Tableau, found: dict[bytes, float]) -> None:
     """Add the sets that differ from the best by one addition, removal or exchange, if they weigh anything."""
-    limit = best.cost - 2.0 * log(BELIEVED)
+    limit = min(found.values()) - 2.0 * log(BELIEVED)
     change = best.changes()
     for j in np.flatnonzero(best.cost + change < limit):
         chosen = best.chosen.copy()

@@ -38,7 +38,7 @@ systems, IEEE Trans. Automatic Control 21, 1976.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np

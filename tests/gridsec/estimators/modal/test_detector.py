@@ -7,7 +7,7 @@ from math import inf, log, sqrt
 import numpy as np
 import pytest
 
-from benchmarks._residuals import Dense, Source, model_of, power_columns, root, tree
+from benchmarks._residuals import Dense, Source, model_of, power_columns, tree
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.modal import detector, full, signatures, static
 from gridsec.estimators.modal import filter as modal
