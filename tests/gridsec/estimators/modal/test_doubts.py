@@ -47,7 +47,7 @@ def played(unknown: Floats | None, error: Floats, ticks: int = 400) -> float:
 
 
 def test_a_lasting_error_along_an_unknown_direction_is_no_evidence() -> None:
-    """3 kW that nobody reads for 300 ticks raise no alarm; without the direction they do."""
+    """3 unread kW for 300 ticks raise no alarm; without the direction they do."""
     error = POWER * COLUMN[:, 0]
     assert played(doubts.WIDER * POWER * COLUMN, error) < 0.0
     assert played(None, error) > 0.0
