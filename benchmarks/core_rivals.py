@@ -4,7 +4,7 @@
 
 Residuals are drawn from the model of `gridsec.estimators.modal` as in `benchmarks.limits`, with what no
 report shows added by the linear model. The first 180 ticks are honest, and nothing is switched in them. The
-core is looked at every fifth tick of the 240 ticks after them.
+core is looked at every tenth tick of the 240 ticks after them.
 
 Loads: a kettle of 2 kW runs for 150 s at every customer, every ten minutes on average; every fifth customer,
 with a connection of 14 kW, charges a car with 11 kW from a random moment on. `late`: every power is 60 s old;
@@ -12,10 +12,12 @@ a step lasts 60 s in the residuals. `unread`: 5 or 30 % of the customers report 
 for good. `liar`: one random meter is off by 1 % from tick 180 on, besides.
 
 Groups: a contiguous third reads wrong by one amount, from tick 180 on or in a ramp of 1 200 s from the start
-on, or a neighbourhood has a fixed error before learning, with 0, 5 or 30 % of the powers unread.
+on, or has a fixed error before learning, with 5 or 30 % of the powers unread, which kettles change.
 
-Columns: runs with an honest meter named, honest meters ever named, manipulated meters named at the end of
-those that there are, ticks without an alarm after the onset, %, and mean time of an identification.
+Loads with meters of class 0.5 %, 0.1 V and 0.05 %, groups with white errors of 0.2 %. Columns: runs with an
+honest meter named, honest meters ever named, manipulated meters named at the end of those that there are,
+ticks evaluated without an alarm after the onset, %, and mean time of an identification. Exits 1 when an honest
+meter is named.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import sys
 import time
 from dataclasses import dataclass
 
@@ -96,9 +99,9 @@ GROUPS = tuple(
         group=kind,
         amount=amount,
     )
-    for kind, amounts in (("step", (0.005, 0.01, 0.03)), ("ramp", (-0.01, 0.03)), ("fixed", (-0.01, -0.03)))
+    for kind, amounts in (("step", (0.005, 0.03)), ("ramp", (-0.01,)), ("fixed", (-0.01, -0.03)))
     for amount in amounts
-    for unread in (0.0, 0.05, 0.3)
+    for unread in (0.05, 0.3)
 )
 
 
@@ -139,7 +142,6 @@ class Result:
     liars: int
     quiet: float
     took: float
-    undecided: float
 
 
 def run(case: Case, feeder: str, meters: TrialMeterErrors, seed: int) -> Result:
@@ -151,7 +153,7 @@ def run(case: Case, feeder: str, meters: TrialMeterErrors, seed: int) -> Result:
     change = unreported(case, front.customers, site(feeder).feeder.base_kva, random)
     effect = front.sensitivities.columns(Power.ACTIVE, np.arange(front.customers))[kernel.model.meters]
     state, ever, named = core.init(kernel, 0.0), np.zeros_like(liars), np.zeros_like(liars)
-    took, quiet, undecided = list[float](), 0, 0
+    took, quiet = list[float](), 0
     for k in range(QUIET + WATCHED):
         _, m, _ = world.tick(lie * level[k] + effect @ change[k])
         state, evidence = core.step(kernel, state, float(k), m)
@@ -165,7 +167,6 @@ def run(case: Case, feeder: str, meters: TrialMeterErrors, seed: int) -> Result:
                 found = core.identify(kernel, state, evidence).found
                 took.append(time.thread_time() - begun)
                 named = found.named
-                undecided += not named.any()
             ever |= named
     return Result(
         int((ever & ~liars).sum()),
@@ -173,34 +174,37 @@ def run(case: Case, feeder: str, meters: TrialMeterErrors, seed: int) -> Result:
         int(liars.sum()),
         100.0 * quiet / WATCHED,
         1e3 * float(np.mean(took)) if took else 0.0,
-        undecided,
     )
 
 
-def table(cases: tuple[Case, ...], feeder: str, runs: int) -> None:
-    """One table."""
-    for meters in (TrialMeterErrors.WHITE, TrialMeterErrors.REAL):
-        for case in cases:
-            found = [run(case, feeder, meters, seed) for seed in range(runs)]
-            honest = [one.honest for one in found]
-            cells = (
-                f"{np.count_nonzero(honest)} of {runs}",
-                sum(honest),
-                f"{sum(one.named for one in found)} of {sum(one.liars for one in found)}",
-                f"{np.mean([one.quiet for one in found]):.0f}",
-                f"{np.mean([one.took for one in found]):.0f}",
-            )
-            row(feeder, meters.name.lower(), case.name, *cells)
+def table(cases: tuple[Case, ...], feeder: str, meters: TrialMeterErrors, runs: int) -> int:
+    """One table; honest meters named."""
+    total = 0
+    for case in cases:
+        found = [run(case, feeder, meters, seed) for seed in range(runs)]
+        honest = [one.honest for one in found]
+        total += sum(honest)
+        cells = (
+            f"{np.count_nonzero(honest)} of {runs}",
+            sum(honest),
+            f"{sum(one.named for one in found)} of {sum(one.liars for one in found)}",
+            f"{np.mean([one.quiet for one in found]):.0f}",
+            f"{np.mean([one.took for one in found]):.0f}",
+        )
+        row(feeder, case.name, *cells)
+    return total
 
 
-def main(runs: int, names: tuple[str, ...]) -> None:
-    """Both tables."""
-    for cases in (LOADS, GROUPS):
-        head("feeder", "meters", "case", "runs", "honest named", "named", "no alarm, %", "ms")
+def main(runs: int, names: tuple[str, ...]) -> int:
+    """Both tables; 1 if an honest meter is named."""
+    honest = 0
+    for cases, meters in ((LOADS, TrialMeterErrors.REAL), (GROUPS, TrialMeterErrors.WHITE)):
+        head("feeder", "case", "runs", "honest named", "named", "no alarm, %", "ms")
         for feeder in names:
-            table(cases, feeder, runs)
+            honest += table(cases, feeder, meters, runs)
+    return int(honest > 0)
 
 
 if __name__ == "__main__":
-    asked = arguments(__doc__, runs=10, feeders=("kerber-dorfnetz", "simbench-lv-rural3", "kerber-landnetz"))
-    main(asked.runs, tuple(asked.feeders))
+    asked = arguments(__doc__, runs=10, feeders=("kerber-landnetz", "kerber-dorfnetz", "simbench-lv-rural3"))
+    sys.exit(main(asked.runs, tuple(asked.feeders)))

@@ -36,13 +36,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from math import inf, log
 
 import numpy as np
 from scipy.cluster.hierarchy import linkage
 from scipy.linalg import blas, cho_solve, cholesky, lapack, solve_triangular
 
-from gridsec.arrays import Bools, Floats, Ints, submatrix
+from gridsec.arrays import Bools, Floats, Ints, frozen, submatrix
 from gridsec.estimators.modal.model import Modes
 
 DOUBT = 1e-3
@@ -51,6 +52,8 @@ MAJORITY = 9.0
 """Least penalty of a meter beyond a third of all, in units of the cost: three standard deviations."""
 BELIEVED = 1e-8
 """Weight below which a set is not kept, 1: far below `DOUBT`."""
+UNLIKELY = 1e-4
+"""Weight below which a set beside one that is not the best is not kept, 1: a tenth of `DOUBT`."""
 ALIKE = 0.99
 """Share of the variance of amounts that meters have in common where they are manipulated alike, 1."""
 SOME = 200
@@ -138,6 +141,7 @@ class Identification:
     problems: tuple[SearchProblem, ...]
 
 
+@lru_cache(maxsize=16)
 def penalties(meters: int) -> Floats:
     """Penalty of k of p meters, for k = 0 to p, (p + 1,).
 
@@ -149,7 +153,7 @@ def penalties(meters: int) -> Floats:
     k = np.arange(meters)
     more = 2.0 * np.log((meters - k) / (k + 1.0))
     more = np.where(k >= max(1, meters // 3), np.maximum(more, MAJORITY), more)
-    return np.concatenate([[0.0], np.cumsum(more)])
+    return frozen(np.concatenate([[0.0], np.cumsum(more)]))
 
 
 def cost(problem: SearchProblem, chosen: Bools) -> float:
@@ -528,12 +532,20 @@ def search(
     ends = [_descended(problem, (np.zeros_like(start), start), batches)]
     for each, _ in rivals:
         ends.append(_descended(each, (np.zeros_like(start), ends[0].chosen), batches))
-    costs = np.array([end.cost for end in ends]) + np.array([0.0, *(cost for _, cost in rivals)])
+    one_amount = [in_common(end.problem, groups, end.chosen) for end in ends]
+    more = (0.0, *(cost for _, cost in rivals))
+    least = [
+        min(end.cost, float(costs(end.problem, sets, ALIKE).min(initial=inf))) + cost
+        for end, sets, cost in zip(ends, one_amount, more, strict=True)
+    ]
     found = []
-    for end, cost in zip(ends, costs, strict=True):
-        near = cost < costs.min() + HOPELESS
-        sets = _explored(end, groups, batches) if near else {end.chosen.tobytes(): end.cost}
-        found.append({key: each + cost - end.cost for key, each in sets.items()})
+    for end, sets, best, cost in zip(ends, one_amount, least, more, strict=True):
+        if best < min(least) + HOPELESS:
+            each = _explored(end, sets, groups, batches)
+        else:
+            each = {end.chosen.tobytes(): end.cost}
+            _with_amounts_alike(end.problem, each, sets[:1])
+        found.append({key: value + cost for key, value in each.items()})
     return _identified(tuple(end.problem for end in ends), tuple(found))
 
 
@@ -549,8 +561,10 @@ def _descended(problem: SearchProblem, starts: tuple[Bools, ...], groups: Groups
     return min(ends, key=lambda end: end.cost) if ends else best
 
 
-def _explored(best: Tableau, groups: tuple[Ints, ...], batches: Groups) -> dict[bytes, float]:
-    """All sets that were met from the best one on, with their costs."""
+def _explored(
+    best: Tableau, one_amount: Bools, groups: tuple[Ints, ...], batches: Groups
+) -> dict[bytes, float]:
+    """All sets that were met from the best one on, and those with one amount, with their costs."""
     problem, found = best.problem, {best.chosen.tobytes(): best.cost}
 
     def keep(tableau: Tableau) -> None:
@@ -577,8 +591,8 @@ def _explored(best: Tableau, groups: tuple[Ints, ...], batches: Groups) -> dict[
     likely = sorted((each, key) for key, each in found.items() if each < best.cost + NEAR)
     for _, key in likely[: EXPANDED + 1]:
         if key != best.chosen.tobytes():
-            _neighbours(_at(problem, np.frombuffer(key, dtype=np.bool_)), found)
-    _with_amounts_alike(problem, found, in_common(problem, groups, best.chosen))
+            _neighbours(_at(problem, np.frombuffer(key, dtype=np.bool_)), found, UNLIKELY)
+    _with_amounts_alike(problem, found, one_amount)
     return found
 
 
@@ -656,13 +670,14 @@ class Common:
     def descend(self) -> Common:
         """Lower the cost by meters and groups until none of them helps."""
         for _ in range(4 * self.inside.size):
-            one, some = self.toggled(), self.grouped()
+            one = self.toggled()
             j = int(one.argmin())
-            if min(one[j], some.min(initial=inf)) >= self.cost - _GAIN:
-                break
-            if one[j] <= some.min(initial=inf):
+            if one[j] < self.cost - _GAIN:
                 self.inside[j] = not self.inside[j]
             else:
+                some = self.grouped()
+                if some.min(initial=inf) >= self.cost - _GAIN:
+                    break
                 remove, g = np.unravel_index(int(some.argmin()), some.shape)
                 self.inside[self.groups[g] > 0.0] = not remove
             self._set()
@@ -731,25 +746,27 @@ def _sized(problem: SearchProblem, chosen: Bools) -> SearchProblem:
 
 def _flipped(best: Tableau, groups: tuple[Ints, ...]) -> list[Tableau]:
     """Tableaus in which the meters of one group are accused in place of the believed and the reverse."""
-    p, out = best.problem.meters, []
+    p, out = best.problem.meters, list[Bools]()
     for group in groups:
         inside = best.chosen[group]
         if inside.any() and group.size > 1:
             chosen = best.chosen.copy()
             chosen[group] = ~inside
             if np.count_nonzero(chosen[:p]) <= max(1, p // 2):
-                out.append((cost(best.problem, chosen), chosen))
-    out.sort(key=lambda each: each[0])
-    return [_at(best.problem, chosen) for _, chosen in out[:_FLIPS]]
+                out.append(chosen)
+    if not out:
+        return []
+    order = np.argsort(costs(best.problem, np.stack(out)), kind="stable")
+    return [_at(best.problem, out[k]) for k in order[:_FLIPS]]
 
 
 _FLIPS = 4
 """Number of flipped groups from which a descent starts: the cheapest ones."""
 
 
-def _neighbours(best: Tableau, found: dict[bytes, float]) -> None:
+def _neighbours(best: Tableau, found: dict[bytes, float], least: float = BELIEVED) -> None:
     """Add the sets that differ from the best by one addition, removal or exchange, if they weigh anything."""
-    limit = min(found.values()) - 2.0 * log(BELIEVED)
+    limit = min(found.values()) - 2.0 * log(least)
     change = best.changes()
     for j in np.flatnonzero(best.cost + change < limit):
         chosen = best.chosen.copy()
