@@ -338,6 +338,7 @@ def _identified(design: ModalDesign, state: ModalState, evidence: Evidence) -> t
     if tick < state.due or not core.alarmed(kernel, evidence):
         return replace(state, suspicion=suspicion), evidence
     suspicion = core.identify(kernel, state.core, evidence)
+    suspicion = verdict.with_complements(kernel, suspicion, design.max_attacked)
     named = suspicion.found.named & ~state.core.masked.meters
     streak = np.where(named, state.streak + 1, 0)
     phases = np.where(verdict.certain_phases(kernel, suspicion), state.phases + 1, 0)
@@ -548,6 +549,8 @@ def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Esti
     v2_bus[first] = np.where(measured.busbar_metered, measured.v0_squared, v2_bus[first])
     variance, of_busbar = variance.copy(), variance[first].copy()
     variance[first] = np.maximum(variance[first], np.where(measured.busbar_metered, front.busbar**2, 0.0))
+    # While the readings disagree and no search has settled it, no reading bounds a voltage.
+    sure = now.trust.trusted & measured.available & (not any_of(state.core.detector.pinned))
     inputs = BoundInputs(
         plant=plant,
         powers=changed(tick.predicted.powers, trusted=now.trust.trusted),
@@ -555,7 +558,7 @@ def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Esti
         model=tick.predicted.v2_bus[plant.feeder.bus],
         busbar=measured.busbar_metered,
         y=measured.y,
-        trusted=now.trust.trusted & measured.available,
+        trusted=sure,
         checked=_Checked(front, measured.frame),
         sigmas=front.sigmas[0],
     )

@@ -5,9 +5,13 @@ The posterior of (w, b) with complete readings has three numbers per mode, and o
 equal variances, and signs of eigenvectors cancel. Means are kept at the meters. So a record means the same on
 every machine, while the model of the residuals is the same.
 
-With missing readings the covariance is full. The record is then diagonal with a variance large enough for an
-upper bound, ``(1 + x) C + T N T' >= P`` for the least x of `ENLARGEMENTS`. It is made at calm moments, and
-kept where it knows the fixed errors better than the earlier one.
+With missing readings the covariance P is full. The record is then diagonal with a variance large enough for
+an upper bound: with C the diagonal of P without theta, and C0 that of the prior,
+
+    (1 + x) C + y C0 + T N T' >= P      N of the information times (1 - y) / (1 + x)^2
+
+for the first (x, y) of `ENLARGEMENTS`. The last one is the prior, which is a bound always. The record is made
+at calm moments, and kept where it knows the fixed errors better than the earlier one.
 
 A record is older than the last reading, by seconds up to `EVERY` ticks. That is a valid posterior with fewer
 readings. While meters are suspect no record is made: it contains nothing of a manipulation that was found.
@@ -23,6 +27,7 @@ from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import Problem, raise_if_any
+from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal import static
 from gridsec.estimators.modal.filter import FilterState, Full
 from gridsec.estimators.modal.model import Modes
@@ -30,10 +35,12 @@ from gridsec.estimators.modal.static import Static
 
 EVERY = 600
 """Ticks from one record with missing readings to the next: it costs O(t^3)."""
-ENLARGEMENTS = (0.1, 0.5, 2.0, 10.0)
-"""Enlargements of the variance that are tried, 1."""
+ENLARGEMENTS = ((0.1, 0.0), (0.3, 0.0), (1.0, 0.0), (1.0, 0.01), (1.0, 0.05), (1.0, 0.2), (0.0, 1.0))
+"""Enlargements (x, y) of the variance that are tried, 1."""
+WIDEST = 2.5
+"""Largest stored variance, in those of the prior, 1: more than the largest enlargement."""
 TOLERANCE = 1.0 + 1e-9
-"""Factor by which stored variances may exceed the prior ones from rounding, 1."""
+"""Factor for rounding, 1."""
 _PREFIX = "filter."
 _ROWS = ("w", "b", "var_w", "cov_wb", "var_b", "felt_w", "felt_b", "information", "busbar", "meters", "t")
 
@@ -56,8 +63,8 @@ class Record:
         return float(self.filter.cov[2].sum())
 
 
-def made(modes: Modes, state: FilterState, known: Static) -> Record | None:
-    """Record of a filter; None where no diagonal covariance is an upper bound.
+def made(modes: Modes, state: FilterState, known: Static) -> Record:
+    """Record of a filter; O(t^3) with a full covariance.
 
     Parameters
     ----------
@@ -66,32 +73,38 @@ def made(modes: Modes, state: FilterState, known: Static) -> Record | None:
     """
     if state.full is None:
         return Record(state, known)
-    for more in ENLARGEMENTS:
-        found = _bounded(modes, state, state.full, static.current(modes, known), more)
-        if found is not None:
-            return found
-    return None
+    known = static.current(modes, known)
+    each = (_bounded(modes, state, state.full, known, *more) for more in ENLARGEMENTS)
+    found = next((one for one in each if one is not None), None)
+    # The prior is a bound up to rounding.
+    return Record(modal.start(modes, state.t), static.start(modes)) if found is None else found
 
 
-def _bounded(modes: Modes, state: FilterState, whole: Full, known: Static, more: float) -> Record | None:
-    """Record with variances enlarged by `more`; None where it is no upper bound."""
+def _bounded(  # noqa: PLR0917  # the filter, and the two enlargements
+    modes: Modes, state: FilterState, whole: Full, known: Static, more: float, prior: float
+) -> Record | None:
+    """Record with enlarged variances; None where it is no upper bound."""
     t, U = modes.size, modes.U
     w, b = np.arange(t), np.arange(t, 2 * t)
     P = np.vstack([U.T @ whole.cov[:t], U.T @ whole.cov[t:]])
     P = np.hstack([P[:, :t] @ U, P[:, t:] @ U])
-    now = static.current(modes, replace(known, information=known.information / (1.0 + more) ** 2))
+    now = static.current(
+        modes, replace(known, information=known.information * (1.0 - prior) / (1.0 + more) ** 2)
+    )
     g_w, g_b = known.signature[:, :, None] * modes.directions
     T = np.vstack([-g_w, modes.directions - g_b])
     rest, bound = P - T @ known.cov @ T.T, T @ now.cov @ T.T - P
     cov = (1.0 + more) * np.stack([rest[w, w], rest[w, b], rest[b, b]])
-    cov = np.stack([np.minimum(cov[0], modes.varying), cov[1], np.minimum(cov[2], modes.lasting)])
+    cov[0] += prior * modes.varying
+    cov[2] += prior * modes.lasting
+    if prior == 1.0:
+        cov = np.stack([modes.varying, np.zeros(t), modes.lasting])
     bound[w, w] += cov[0]
     bound[w, b] += cov[1]
     bound[b, w] += cov[1]
     bound[b, b] += cov[2]
-    # Rounding at modes of the prior variance.
-    bound[np.diag_indices(2 * t)] *= TOLERANCE
-    bound[np.diag_indices(2 * t)] += np.finfo(np.float64).eps
+    # A mode of two meters at one bus has no loads: its variance of w is 0.
+    bound[np.diag_indices(2 * t)] += np.finfo(np.float64).eps * (1.0 + cov[2].max())
     _, failed = lapack.dpotrf(bound, lower=True)
     if failed or (cov[0] < 0.0).any() or (cov[2] <= 0.0).any():
         return None
@@ -116,9 +129,7 @@ def kept(modes: Modes, before: Record | None, state: FilterState, known: Static,
     if ticks % EVERY:
         return before
     found = made(modes, state, known)
-    if found is None or (before is not None and before.loss() < found.loss()):
-        return before
-    return found
+    return before if before is not None and before.loss() < found.loss() else found
 
 
 def to_arrays(modes: Modes, record: Record | None) -> dict[str, Floats]:
@@ -212,8 +223,8 @@ def _problems(modes: Modes, arrays: Mapping[str, Floats], names: list[str]) -> l
         return [Problem("not-finite", f"{name} is no number") for name in finite]
     var_w, cov_wb, var_b = (arrays[_PREFIX + name] for name in ("var_w", "cov_wb", "var_b"))
     rules: tuple[tuple[str, Bools], ...] = (
-        ("var_w", (var_w >= 0.0) & (var_w <= TOLERANCE * modes.varying)),
-        ("var_b", (var_b > 0.0) & (var_b <= TOLERANCE * modes.lasting)),
+        ("var_w", (var_w >= 0.0) & (var_w <= WIDEST * modes.varying)),
+        ("var_b", (var_b > 0.0) & (var_b <= WIDEST * modes.lasting)),
         ("cov_wb", cov_wb * cov_wb <= TOLERANCE * var_w * var_b),
         ("information", arrays[_PREFIX + "information"] >= 0.0),
         ("t", arrays[_PREFIX + "t"] == arrays[_PREFIX + "t"][0]),

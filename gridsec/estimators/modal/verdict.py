@@ -16,7 +16,7 @@ CLEAN: none of these.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import log
 
 import numpy as np
@@ -26,7 +26,7 @@ from gridsec.estimators.detection import DecisionInputs, decide
 from gridsec.estimators.modal import masking, signatures
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import SIZE, WEIGHTS, Evidence
-from gridsec.estimators.modal.search import amounts
+from gridsec.estimators.modal.search import DOUBT, amounts
 from gridsec.estimators.plant import NO_VOLTAGE
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.measurements import largest_offset, unusable_offsets
@@ -43,8 +43,8 @@ LIKELY = 0.01
 """Weight from which on an explanation is reported, 1."""
 SHOWN = 20
 """Largest number of reported explanations."""
-ALONE = 1e-3
-"""Weight of all explanations without the busbar's meter below which it is named, 1: as `search.DOUBT`."""
+LEADING = 0.2
+"""Weight from which on an explanation with the busbar's meter has a rival without it, 1."""
 LEAST_PRECISION = 1e-6
 """Least precision of a reading, 1 / squared pu^2: below it nothing is known of a voltage."""
 LEAST_V2 = 1e-2
@@ -202,6 +202,50 @@ def explanations(
     return tuple(out)
 
 
+def with_complements(core: Core, suspicion: Suspicion, most: int) -> Suspicion:
+    """Explanations with a rival for each that accuses a phase of the busbar and some of its meters.
+
+    A phase of the busbar that is off by one amount, with some of its meters off by the opposite one, looks
+    like all other meters of the phase being off. Where those are at most `most`, both are equally likely.
+    Explanations below `LEADING` bring no rival.
+
+    Parameters
+    ----------
+    core, suspicion
+        The core, and the explanations.
+    most
+        Largest number of manipulated meters.
+    """
+    found, p = suspicion.found, core.modes.size
+    H = core.model.phases(core.modes.at) > 0.0
+    H, first = H[:, H.any(axis=0)], p + core.faults.powers
+    rows, models, weights = [], [], []
+    leading = found.weight >= LEADING
+    each = zip(found.chosen[leading], found.model[leading], found.weight[leading], strict=True)
+    for chosen, model, weight in each:
+        for phase in np.flatnonzero(chosen[first:]).tolist():
+            of_phase = H[:, phase]
+            others = of_phase & ~chosen[:p]
+            if any_of(chosen[:p] & of_phase) and np.count_nonzero(others | (chosen[:p] & ~of_phase)) <= most:
+                rival = chosen.copy()
+                rival[:p] = others | (chosen[:p] & ~of_phase)
+                rival[first + phase] = False
+                rows.append(rival)
+                models.append(model)
+                weights.append(weight)
+    if not rows:
+        return suspicion
+    weight = np.concatenate([found.weight, weights])
+    order, weight = np.argsort(-weight, kind="stable"), weight / weight.sum()
+    chosen = np.vstack([found.chosen, rows])[order]
+    named = weight[order] @ ~chosen[:, :p] < DOUBT
+    every = np.concatenate([found.model, models])[order]
+    return replace(
+        suspicion,
+        found=replace(found, chosen=chosen, model=every, weight=weight[order], named=np.asarray(named)),
+    )
+
+
 def accused(core: Core, suspicion: Suspicion) -> Bools:
     """Meters that a likely explanation accuses, (p,)."""
     found = suspicion.found
@@ -217,7 +261,7 @@ def certain_phases(core: Core, suspicion: Suspicion) -> Bools:
         The core, and the explanations.
     """
     found, first = suspicion.found, core.modes.size + core.faults.powers
-    return np.asarray(found.weight @ ~found.chosen[:, first:] < ALONE)
+    return np.asarray(found.weight @ ~found.chosen[:, first:] < DOUBT)
 
 
 # --- Verdict ---
