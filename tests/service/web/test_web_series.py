@@ -98,6 +98,9 @@ def test_a_suspect_compared_with_its_reconstruction(
 ) -> None:
     running, meters = live
     liar, other = meters[LIAR], meters[0]
+    state = running.state()
+    assert (state["displayed"]["verdict"], state["displayed"]["suspects"]) == ("attacked", [liar])
+    assert state["displayed"]["since"] >= state["t"] - TICKS + ONSET
     page = opened("", size, scheme)
     page.locator('.alarm:has-text("Meter manipulated") button:has-text("Time series")').first.click()
     expect(page.locator("#series-title")).to_be_focused()
@@ -154,6 +157,7 @@ def test_a_suspect_compared_with_its_reconstruction(
     assert page.url.endswith(f"#{FEEDER}")
 
 
+@pytest.mark.acceptance
 def test_zoom_by_pointer_and_keyboard(opened: Callable[..., Page], live: tuple[InProcess, list[str]]) -> None:
     running, meters = live
     page = opened(f"#{FEEDER}?series={meters[LIAR]}&span=3600")
