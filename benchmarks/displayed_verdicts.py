@@ -2,8 +2,8 @@
 
     python -m benchmarks.displayed_verdicts [FEEDER] [MINUTES] [PERCENT]
 
-Without an attack, and with a meter that is manipulated from the middle on. Limit: a tenth of the changes of the
-raw verdict. The delay is that of the displayed ATTACKED after the first raw one.
+Without an attack, and with a meter that is manipulated from the middle on. Limit: a tenth of the changes of
+the raw verdict. The delay is that of the displayed ATTACKED after the first raw one.
 """
 
 from __future__ import annotations
