@@ -2,8 +2,8 @@
 
     python -m benchmarks.displayed_verdicts [FEEDER] [MINUTES] [PERCENT]
 
-Without an attack, and with a meter that is manipulated from the middle on. Limit: one change of the displayed
-verdict per two minutes. The delay is that of the displayed ATTACKED after the first raw one.
+Without an attack, and with a meter that is manipulated from the middle on. Limit: a tenth of the changes of
+the raw verdict. The delay is that of the displayed ATTACKED after the first raw one.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from gridsec.interface import Decision
 from service.engine.replay import ReplayCounts, replay
 from service.report.report import FeederReport
 
-PER_MINUTE = 0.5
-"""Limit of the changes of the displayed verdict, 1/min."""
+SHARE = 0.1
+"""Limit of the changes of the displayed verdict, relative to those of the raw one."""
 
 
 def reports(site: Site, scenario: Scenario) -> list[FeederReport]:
@@ -56,12 +56,13 @@ def main() -> int:
         found = reports(site, scenario)
         shown = [one.displayed.verdict for one in found if one.displayed is not None]
         count = changes(shown)
-        missed |= count > PER_MINUTE * given.minutes
+        raw_count = changes([one.verdict for one in found])
+        missed |= count > SHARE * raw_count
         shares = {
             what: ", ".join(f"{verdict} {n / len(all_):.0%}" for verdict, n in Counter(all_).most_common())
             for what, all_ in (("raw", [one.verdict for one in found]), ("displayed", shown))
         }
-        print(f"{name}: raw {changes([one.verdict for one in found])} changes ({shares['raw']}), ", end="")
+        print(f"{name}: raw {raw_count} changes ({shares['raw']}), ", end="")
         print(f"displayed {count} changes ({shares['displayed']})")
         if scenario is attacked:
             raw = next((one.t for one in found if one.verdict is Decision.ATTACKED), None)

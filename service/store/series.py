@@ -119,8 +119,8 @@ ROLLUP_S: Final = 120.0
 """Duration of a roll-up, s: 24 hours have 720, one per pixel column."""
 ROWS_S: Final = 6 * 3600.0
 """Longest series that is merged from rows, s; a longer one uses roll-ups."""
-MAX_ROWS: Final = 50_000
-"""Largest number of rows of one series: those of 14 hours at one row per second."""
+MAX_ROWS: Final = 25_000
+"""Largest number of rows of one series, 60 MB at 146 meters: those of `ROWS_S` at one row per second."""
 LONGEST_S: Final = 15 * 86400.0
 """Longest series, s."""
 BAND_STD: Final = 3.0

@@ -52,10 +52,13 @@ function certainty(report, shown) {
   const tested = `${judged.length} of ${report.meters.length} meters tested`;
   if (shown.verdict === "attacked") {
     const named = judged.filter((m) => shown.suspects.includes(m.meter));
-    if (!named.length) return `${tested} at this tick.`;
+    if (!named.length || report.verdict !== "attacked") return `${tested} at this tick.`;
     const strongest = named.reduce((a, b) => (ratio(b) > ratio(a) ? b : a));
     const rivals = report.explanations?.length ? ` Explanations: ${report.explanations.slice(0, 3).map(explanationWords).join(", ")}.` : "";
-    return `Strongest evidence at this tick: ${strongest.meter}, ${times(ratio(strongest))} times the largest score of an honest meter.${rivals}`;
+    const much = ratio(strongest) > 1
+      ? `Strongest evidence at this tick: ${strongest.meter}, ${times(ratio(strongest))} times the largest score of an honest meter.`
+      : `Named by earlier readings; at this tick the largest score is ${percent(ratio(strongest))} of its threshold (${strongest.meter}).`;
+    return `${much}${rivals}`;
   }
   if (shown.verdict === "clean") {
     if (!judged.length) return `${tested} at this tick.`;

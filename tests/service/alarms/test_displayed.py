@@ -7,7 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from feeders.model.site import load
@@ -90,6 +90,7 @@ def test_skipped_ticks_and_a_clock_set_back() -> None:
 letters = st.text("ACUS", min_size=1, max_size=60)
 
 
+@settings(max_examples=60)
 @given(letters)
 def test_the_page_and_the_alarm_list_agree(sequence: str) -> None:
     """When the alarm of a manipulation rises, ATTACKED is displayed; when it clears, CLEAN is."""
@@ -106,6 +107,7 @@ def test_the_page_and_the_alarm_list_agree(sequence: str) -> None:
         assert display.shown.since <= display.shown.t <= report.t
 
 
+@settings(max_examples=60)
 @given(letters)
 def test_no_answer_never_stays_behind_another_verdict(sequence: str) -> None:
     """A lasting verdict is displayed after its delay, and two changes are more than the shorter one apart."""

@@ -93,22 +93,23 @@ def check(
     inside = [one for one in reports if found.since <= one.t < found.until]
     for k, meter in enumerate(meters):
         wanted = expected(inside, meter, found.bucket_s, until)
+        each = [wanted[t] for t in sorted(wanted)]
         assert found.buckets.t.tolist() == sorted(wanted)
-        for j, t in enumerate(found.buckets.t.tolist()):
-            bucket = wanted[t]
-            assert found.buckets.ticks[j] == bucket["ticks"]
-            assert found.buckets.suspect[j, k] == bucket["suspect"]
-            assert found.buckets.verdict_s[j] == pytest.approx([bucket[str(v)] for v in VERDICTS], abs=1e-4)
-            for name, value in zip(EXTREMES, found.buckets.extremes[j, :, k].tolist(), strict=True):
-                assert value == pytest.approx(bucket.get(name, math.nan), abs=1e-4, nan_ok=True)
+        assert found.buckets.ticks.tolist() == [bucket["ticks"] for bucket in each]
+        assert found.buckets.suspect[:, k].tolist() == [bucket["suspect"] for bucket in each]
+        lasted = np.array([[bucket[str(v)] for v in VERDICTS] for bucket in each])
+        np.testing.assert_allclose(found.buckets.verdict_s, lasted, atol=1e-4)
+        numbers = np.array([[bucket.get(name, math.nan) for name in EXTREMES] for bucket in each])
+        np.testing.assert_allclose(found.buckets.extremes[:, :, k], numbers, atol=1e-4, equal_nan=True)
     return found
 
 
+@pytest.mark.canary("sqlite")
 @both
 def test_roll_ups_and_rows_merge_to_the_same_buckets(url: str) -> None:
     """Nine hours with gaps, another set of meters, a restart, and a clock that was set back."""
     draw = np.random.default_rng(1)
-    times = np.sort(BEGIN + np.unique(draw.uniform(0.0, 9 * 3600.0, 700).round(1)))
+    times = np.sort(BEGIN + np.unique(draw.uniform(0.0, 9 * 3600.0, 420).round(1)))
     times = times[(times < BEGIN + 4000.0) | (times > BEGIN + 9000.0)]
     sets = (("m0", "m1"), ("m1", "m2", "m0"))
     reports = [a_report(t, draw, sets[t > BEGIN + 20_000.0]) for t in times.tolist()]
@@ -129,18 +130,18 @@ def test_roll_ups_and_rows_merge_to_the_same_buckets(url: str) -> None:
         assert whole.bucket_s == ROLLUP_S
         assert whole.complete
         check(store, every, meters, since=BEGIN, until=end, buckets=40)
-        check(store, every, meters, since=times[200], until=end, buckets=200)
+        check(store, every, meters, since=times[120], until=end, buckets=200)
         check(store, every, meters, since=end - 3600.0, until=end, buckets=600)
         assert check(store, every, ("m1",), since=end - 6 * 3600.0, until=end, buckets=2000).bucket_s == 20.0
         with store._connections.read() as connection:
             rolled = connection.execute(ROLLUP.select().with_only_columns(ROLLUP.c.t)).scalars().all()
-        assert len(set(rolled)) > 100
+        assert len(set(rolled)) > 80
 
 
 def test_rows_of_version_1_stay_readable_and_have_no_band(tmp_path: Path) -> None:
     """A database with rows of the earlier version is rolled up step by step; the answer is the same."""
     draw = np.random.default_rng(2)
-    reports = [a_report(BEGIN + 80.0 * k, draw) for k in range(300)]
+    reports = [a_report(BEGIN + 200.0 * k, draw) for k in range(120)]
     ids = ("m0", "m1", "substation")
     with Store(f"sqlite:///{tmp_path}/g.db", history=FINE) as store:
         store.commit(reports=reports)
@@ -159,15 +160,15 @@ def test_rows_of_version_1_stay_readable_and_have_no_band(tmp_path: Path) -> Non
                 connection.execute(HISTORY.update().where(HISTORY.c.t == one.t).values(data=old))
     plain = [replace(one, meters=tuple(replace(m, v_volt_std=None) for m in one.meters)) for one in reports]
     with Store(f"sqlite:///{tmp_path}/g.db", history=FINE) as store:
-        end = BEGIN + 80.0 * 300
+        end = BEGIN + 200.0 * 120
         check(store, plain, ("m0", "m1"), since=BEGIN, until=end, buckets=300)
-        for k in range(20):
+        for k in range(14):
             plain.append(a_report(end + k, draw))
             store.commit(reports=plain[-1:])
-            if k % 5 == 0:
+            if k % 6 == 0:
                 check(store, plain, ("m0", "m1"), since=BEGIN, until=end + k + 1.0, buckets=300)
         with store._connections.read() as connection:
-            assert len(connection.execute(ROLLUP.select()).all()) == 200
+            assert len(connection.execute(ROLLUP.select()).all()) == 120
 
 
 @pytest.mark.acceptance

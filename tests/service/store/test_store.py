@@ -189,6 +189,7 @@ def test_history_keeps_a_grid_and_every_change(url: str) -> None:
             "model_only": False,
             "v_volt_reported": 230.0,
             "v_volt_estimated": 229.5,
+            "v_volt_std": 0.1,
             "score": 1e-4,
             "threshold": 2e-3,
         }
