@@ -24,7 +24,7 @@ const alarms = new Alarms({
     if (feeder !== page.feeder?.name) await show(feeder);
     if (feeder !== page.feeder?.name) return;
     const customer = page.feeder?.layout.customers.find((c) => (owner ? c.customer === owner : c.meter === meter));
-    if (customer) select(customer.customer);
+    if (customer) bring(customer.customer);
   },
   onLink: (up) => { page.alarmsLinked = up; },
 });
@@ -161,7 +161,7 @@ function verdict() {
   }
   const customer = new Map(feeder.layout.customers.map((c) => [c.meter, c.customer]));
   const chip = (meter, kind, text) => el("button", {
-    type: "button", class: "chip", "data-status": kind, text, on: { click: () => select(customer.get(meter) ?? null) },
+    type: "button", class: "chip", "data-status": kind, text, on: { click: () => bring(customer.get(meter) ?? null) },
   });
   const suspects = report.meters.filter((m) => m.suspect);
   const liar = report.busbar?.suspect ? [report.busbar] : [];
@@ -170,7 +170,7 @@ function verdict() {
     ...[...suspects, ...liar].map((m) => chip(m.meter, "suspect", `${deviceName(m.meter, customer.get(m.meter))} ${signed(m.attack_volt_estimated)} V`)),
     ...inverters.map((i) => el("button", {
       type: "button", class: "chip", "data-status": "suspect",
-      text: `inverter of ${i.customer} ${signed(i.attack_kvar_estimated)} kvar`, on: { click: () => select(i.customer) },
+      text: `inverter of ${i.customer} ${signed(i.attack_kvar_estimated)} kvar`, on: { click: () => bring(i.customer) },
     })),
     ...report.silent.map((s) => chip(s.meter, "silent", `${deviceName(s.meter, customer.get(s.meter))} silent ${isKnown(s.seconds) ? duration(s.seconds) : ""}`)));
   const several = diagram.level === null;
@@ -242,6 +242,12 @@ function fresh() {
 }
 
 // ------------------------------------------------------------- one customer
+
+// Select a customer, and where the drawing stands below the alarms scroll to it.
+function bring(id) {
+  select(id);
+  if (id !== null && matchMedia("(max-width: 980px)").matches) byId("diagram").scrollIntoView({ block: "center" });
+}
 
 function select(id) {
   page.selected = id;

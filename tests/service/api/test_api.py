@@ -59,7 +59,7 @@ def test_state_is_the_report(setup: Setup) -> None:
         *("meter", "bus", "seen", "suspect", "score", "threshold", "v_volt_reported", "v_volt_estimated"),
         *("v_volt_std", "v2_pu_estimated", "attack_volt_estimated", "kind", "phase"),
         *("v_min_volt", "v_max_volt", "model_only", "learning_state", "learning_reason", "clock_offset_s"),
-            "customer",
+        "customer",
     }
     assert contract | {"customers", "inverters", "explanations"} <= set(response.json())
     assert all(set(item) == meter for item in response.json()["meters"])

@@ -46,9 +46,7 @@ def fill_of(page: Page, name: str) -> tuple[int, int, int]:
 
 def magnification(page: Page) -> float:
     """Pixels of the window per pixel of the drawing."""
-    value: float = page.locator("#diagram .world").evaluate(
-        "g => g.transform.baseVal.consolidate().matrix.a"
-    )
+    value: float = page.locator("#diagram .world").evaluate("g => g.transform.baseVal.consolidate().matrix.a")
     return value
 
 
