@@ -2,8 +2,8 @@
 
     python -m benchmarks.overview [feeders ...] [--page]
 
-Every feeder is the low-voltage network simbench-lv-rural1 with its own name, a monitor and a real report: steps
-of its estimator on full AC power flow. One in fifty has two manipulated meters. HTTP application, store
+Every feeder is the network simbench-lv-rural1 with its own name, a monitor and a real report: steps of its
+estimator on full AC power flow. One in fifty has two manipulated meters. HTTP application, store
 (SQLite), routes and monitors are those of the service. Printed per number of feeders, medians of 15 requests
 over a real connection, gzip included:
 
@@ -12,8 +12,8 @@ over a real connection, gzip included:
 - ratio: of both times.
 
 With `--page` a browser (Chromium) shows them. Printed besides: time from the navigation to the first row of
-the list (median of 3), time from a stored verdict to its number above the list (median of 5), time of a scroll
-step with layout (median of 20), and the number of elements of the document.
+the list (median of 3), time from a stored verdict to its number above the list (median of 5), time of a
+scroll step with layout (median of 20), and the number of elements of the document.
 """
 
 from __future__ import annotations
@@ -232,7 +232,8 @@ def in_browser(url: str, fleet: Fleet) -> str:
         browser.close()
     return (
         f"first rows {1e3 * statistics.median(first):.0f} ms, change shown after "
-        f"{statistics.median(changes):.1f} s (at most {max(changes):.1f} s), a scroll step {drawn:.1f} ms, {elements} elements"
+        f"{statistics.median(changes):.1f} s (at most {max(changes):.1f} s), a scroll step {drawn:.1f} ms, "
+        f"{elements} elements"
     )
 
 
