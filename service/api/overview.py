@@ -1,7 +1,7 @@
 """List of all feeders: status, order, filters and pages.
 
-A page is bounded, so that the answer for a fleet of thousands stays small. The status is that of the web page:
-its list, its selector and the title of its tab show the same.
+A page is bounded, so that the answer for a fleet of thousands stays small. The web page shows the same status
+in its list, its selector and the title of its tab.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Standing:
 def standing(
     fields: Mapping[str, Any], report: FeederReport | None, age_s: float | None, alarms: AlarmCounts | None
 ) -> Standing:
-    """Return the state of a feeder from its fields, its latest report, the report's age, s, and its alarms."""
+    """Return the state of a feeder from its fields, its latest report with its age, s, and its alarms."""
     suspects = 0
     if report is not None:
         suspects = len(report.suspects) + sum(inverter.suspect for inverter in report.inverters)

@@ -392,7 +392,7 @@ _SHOWN: Final = 5
 
 
 def reason_of(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> str:
-    """Return the reason of a verdict, with the meters' names as on the page: the monitor uses customers only."""
+    """Return the reason of a verdict, with the meters' names as on the page; the monitor uses customers."""
     suspects = np.flatnonzero(verdict.suspects).tolist()
     unseen = [k for k, reading in enumerate(tick.readings) if reading is None]
     named = _listed(site, suspects)

@@ -20,7 +20,7 @@ const pick = async (feeder, meter, owner) => {
   if (feeder !== page.feeder?.name) await show(feeder);
   if (feeder !== page.feeder?.name) return;
   const customer = page.feeder?.layout.customers.find((c) => (owner ? c.customer === owner : c.meter === meter));
-  if (customer) select(customer.customer);
+  if (customer) bring(customer.customer);
 };
 const alarms = new Alarms({
   onPick: pick,
@@ -36,7 +36,7 @@ const incidents = new Incidents({ alarms, onPick: pick });
 
 const fleet = new Fleet({ onPick: (name) => show(name), onChange: (attacked) => { page.others = attacked; title(); } });
 const series = new Series({ onChange: () => address() });
-const banner = new Banner({ onSelect: (id) => select(id), onSeries: (meters) => series.open(meters) });
+const banner = new Banner({ onSelect: (id) => bring(id), onSeries: (meters) => series.open(meters) });
 const commissioning = new Commissioning({ onChange: () => detail() });
 
 // Address of the page: the feeder, and the shown time series.
@@ -242,6 +242,12 @@ function fresh() {
 }
 
 // ------------------------------------------------------------- one customer
+
+// Select a customer, and where the drawing stands below the alarms scroll to it.
+function bring(id) {
+  select(id);
+  if (id !== null && matchMedia("(max-width: 980px)").matches) byId("diagram").scrollIntoView({ block: "center" });
+}
 
 function select(id) {
   page.selected = id;

@@ -11,7 +11,8 @@ const SHOWN = 8; // Rows of the short list.
 const HEAD = 50; // Feeders in the selector.
 const PAGE = 80; // Rows that are loaded around the visible ones.
 const AROUND = 8; // Rows that are drawn above and below the visible ones.
-const ROW = 33; // Height of a row, px, as in the style sheet.
+const NARROW = matchMedia("(max-width: 620px)");
+const rowHeight = () => (NARROW.matches ? 46 : 33); // Height of a row, px, as in the style sheet.
 const WORDS = { attacked: "ATTACKED", undecided: "UNDECIDED", "no-data": "NO DATA", "not-monitored": "NOT MONITORED", clean: "CLEAN" };
 
 const titleOf = (feeder) => feeder.title || feeder.name;
@@ -92,7 +93,7 @@ export class Fleet {
   async load() {
     this.turn += 1;
     const { turn } = this;
-    const offset = Math.max(0, Math.floor(byId("fleet-scroll").scrollTop / ROW) - PAGE / 4);
+    const offset = Math.max(0, Math.floor(byId("fleet-scroll").scrollTop / rowHeight()) - PAGE / 4);
     const query = new URL(this.query({ offset, limit: PAGE }), location.href);
     const text = byId("fleet-filter").value.trim();
     if (text) query.searchParams.set("text", text);
@@ -134,8 +135,8 @@ export class Fleet {
   // First and last drawn row of the long list.
   window() {
     const box = byId("fleet-scroll");
-    const first = Math.floor(box.scrollTop / ROW) - AROUND;
-    return [Math.max(0, first), Math.min(this.total, first + 2 * AROUND + Math.ceil(box.clientHeight / ROW) + 1)];
+    const first = Math.floor(box.scrollTop / rowHeight()) - AROUND;
+    return [Math.max(0, first), Math.min(this.total, first + 2 * AROUND + Math.ceil(box.clientHeight / rowHeight()) + 1)];
   }
 
   select(name) {
@@ -179,7 +180,7 @@ export class Fleet {
     byId("fleet-table").setAttribute("aria-rowcount", String((open ? this.total : this.size) + 1));
     const gap = (rows, key) => {
       const node = this[key] ??= el("tr", { class: "gap", "aria-hidden": true }, el("td", { colspan: 6 }));
-      node.firstChild.style.height = `${rows * ROW}px`;
+      node.firstChild.style.height = `${rows * rowHeight()}px`;
       return rows > 0 ? [node] : [];
     };
     const focused = document.activeElement?.closest?.("#fleet-rows tr")?.dataset.feeder;
@@ -252,7 +253,7 @@ export class Fleet {
     const k = Math.min(last, Math.max(0, next));
     const find = () => byId("fleet-rows").querySelector(`tr[aria-rowindex="${k + 2}"] button`);
     if (!find()) {
-      byId("fleet-scroll").scrollTop = k * ROW - byId("fleet-scroll").clientHeight / 2;
+      byId("fleet-scroll").scrollTop = k * rowHeight() - byId("fleet-scroll").clientHeight / 2;
       await this.load().catch(() => {});
     }
     find()?.focus();

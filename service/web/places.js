@@ -117,7 +117,7 @@ export function mapPlaces(layout, window) {
   const [xs, ys] = [xy.map((p) => p[0]), xy.map((p) => p[1])];
   const [left, right, low, high] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
   const span = [right - left || 1, high - low || 1];
-  const pad = 34;
+  const pad = 44;
   const factor = Math.min((window.width - 2 * pad) / span[0], (window.height - 2 * pad) / span[1]);
   const world = { width: window.width, height: Math.max(240, span[1] * factor + 2 * pad) };
   const at = (k) => ({

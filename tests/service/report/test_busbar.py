@@ -96,9 +96,9 @@ def test_it_is_reported_in_volts_and_named_in_words(site: Site) -> None:
     beside = build(site, tick(site, base - 2.3), 2, *said(site, [True], [-2.3], lying=(1, 2)))
     assert beside.suspects == ("m02", "m03", BUSBAR)
     assert beside.reason == (
-        "Manipulated: m02 · LV1.101 Load 2, m03 · LV1.101 Load 3 and the substation's meter; further off than "
-        "meter accuracy and load uncertainty allow. The substation's meter reads 2.3 V (1.0 %) less than the meters of the feeder "
-        "imply."
+        "Manipulated: m02 · LV1.101 Load 2, m03 · LV1.101 Load 3 and the substation's meter; further off "
+        "than meter accuracy and load uncertainty allow. The substation's meter reads 2.3 V (1.0 %) less "
+        "than the meters of the feeder imply."
     )
     silent = build(site, tick(site, None), 2, *said(site, [True], [6.9]))
     assert silent.reason == "Manipulated: the substation's meter; it has no reading at present."

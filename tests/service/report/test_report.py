@@ -109,9 +109,8 @@ def test_reasons_name_meters_as_alarms_do(site: Site) -> None:
     assert reason(Cause.SILENT_METERS, unseen=(4,)) == "No reading from m05 · LV1.101 Load 5."
     for k, customer in enumerate(customers):  # One customer's name begins another's.
         text = f"The loads are not known well enough to judge {customer}, {customers[0]}."
-        assert reason(Cause.AMBIGUOUS, text).endswith(
-            f" judge {site.meter_ids[k]} · {customer}, m01 · {customers[0]}."
-        )
+        names = f"{site.meter_ids[k]} · {customer}, m01 · {customers[0]}"
+        assert reason(Cause.AMBIGUOUS, text).endswith(f" judge {names}.")
     assert reason(Cause.NO_BUSBAR, "as it is") == "as it is"
 
 
@@ -267,8 +266,8 @@ def test_ambiguity_is_one_sentence_and_a_list(site: Site) -> None:
     owner = site.feeder.customers[site.droop.customer[1]]
     a, b, c = site.feeder.customers[:3]
     assert report.reason == (
-        f"Several explanations fit: m02 · {b} and the reported power of {c} (70%) or else the inverter of {owner} "
-        f"(20%) or else the reported powers of {a}, {b} (10%)."
+        f"Several explanations fit: m02 · {b} and the reported power of {c} (70%) or else the inverter of "
+        f"{owner} (20%) or else the reported powers of {a}, {b} (10%)."
     )
     assert report.explanations == (
         ExplanationReport(("m02",), (), 0.7, (c,)),

@@ -94,9 +94,8 @@ def test_suspects_never_collapse_and_each_customer_has_one_place(site: Site, whi
     for layout in layouts:
         every = range(len(layout["customers"]))
         sets = ([], draw.sample(every, min(3, len(every))), list(every))
-        made = page.evaluate(
-            FITTED, [layout, [*((shown, 30, 8) for shown in (*sets, *sets)), ([], 1e9, 1e9)]]
-        )
+        choices = [*((shown, 30, 8) for shown in (*sets, *sets)), ([], 1e9, 1e9)]
+        made = page.evaluate(FITTED, [layout, choices])
         assert made[:3] == made[3:6]
         assert made[6]["stubs"] == []
         for shown, grid in zip(sets, made[:3], strict=True):
@@ -322,14 +321,12 @@ def test_colours_follow_the_limits_and_can_be_told_apart(site: Site, scheme: str
     site.tick(T0, volts={"H1": 222.0, "H2": 240.0, "H3": 206.0, "H4": 255.0})
     page = site.open(color_scheme=scheme, reduced_motion="reduce")
     expect(page.locator("#decision")).to_have_text("CLEAN")
-    fills = {
-        name: customer(page, name).locator(".shape").evaluate("e => e.style.fill") for name in ("H1", "H2")
-    }
+    shapes = {name: customer(page, name).locator(".shape") for name in ("H1", "H2")}
+    fills = {name: shape.evaluate("e => e.style.fill") for name, shape in shapes.items()}
     # Another range of the readings changes no colour.
     site.tick(T0 + 1, volts={"H1": 222.0, "H2": 240.0})
     expect(customer(page, "H3")).to_have_attribute("data-status", "ok")
-    for name, fill in fills.items():
-        assert customer(page, name).locator(".shape").evaluate("e => e.style.fill") == fill
+    assert fills == {name: shape.evaluate("e => e.style.fill") for name, shape in shapes.items()}
     assert page.locator("#scale .tick").all_text_contents() == [
         "207.8 Vlow limit, 0.900 pu",
         "230.9 Vnominal, 1.000 pu",
@@ -337,16 +334,16 @@ def test_colours_follow_the_limits_and_can_be_told_apart(site: Site, scheme: str
     ]
     bar, mark = box(page.locator("#scale .bar")), box(page.locator("#scale .present"))
     assert 0.05 < mark["width"] / bar["width"] < 0.6
-    names = ("below", "low2", "low1", "mid", "high1", "high2", "above")
+    tones = ("below", "low2", "low1", "mid", "high1", "high2", "above")
     colours = [
         page.evaluate("n => getComputedStyle(document.documentElement).getPropertyValue('--v-' + n)", name)
-        for name in names
+        for name in tones
     ]
     rgb = [np.array([int(c.strip()[k : k + 2], 16) for k in (1, 3, 5)]) / 255.0 for c in colours]
     for matrix in SIGHT.values():
         lab = [seen_by(colour, matrix) for colour in rgb]
-        for k, m in itertools.combinations(range(len(names)), 2):
-            assert np.linalg.norm(lab[k] - lab[m]) > 12.0, (names[k], names[m])
+        for k, m in itertools.combinations(range(len(tones)), 2):
+            assert np.linalg.norm(lab[k] - lab[m]) > 12.0, (tones[k], tones[m])
 
 
 def test_page_and_service_name_a_meter_alike(site: Site) -> None:

@@ -135,13 +135,12 @@ def test_numbers_by_verdict_filter_the_list(
     page.fill("#ack-who", "Ada")
     page.locator("#ack-form .primary").click()
     expect(first.locator("td").nth(4)).to_have_text("2, 1 new")
-    page.locator('#fleet-counts button[data-state="undecided"]').click()
+    undecided = page.locator('#fleet-counts button[data-state="undecided"]')
+    undecided.click()
     expect(page.locator("#fleet-rows tr")).to_have_count(1)
     expect(page.locator("#fleet-rows th")).to_contain_text("Three")
-    expect(page.locator('#fleet-counts button[data-state="undecided"]')).to_have_attribute(
-        "aria-pressed", "true"
-    )
-    page.locator('#fleet-counts button[data-state="undecided"]').click()
+    expect(undecided).to_have_attribute("aria-pressed", "true")
+    undecided.click()
     expect(page.locator("#fleet-rows tr")).to_have_count(3)
     # A page of another feeder than the shown one: one number of attacked feeders everywhere.
     expect(page).to_have_title("1 ATTACKED | NO DATA – One, 4 customers – gridsec")
