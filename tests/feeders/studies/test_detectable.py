@@ -165,6 +165,7 @@ def test_what_the_study_calls_undetected_is_clean_and_one_and_a_half_times_it_is
         assert not clean[-10:].any()
 
 
+@pytest.mark.acceptance
 def test_the_error_of_an_undetected_pair_is_the_one_promised(cigre: Detectable) -> None:
     setting = Setting("cigre-lv", Model.MATCHED, learned=True, seed=1)
     known, (_, _, tests) = learned_day(setting), promise("cigre-lv")

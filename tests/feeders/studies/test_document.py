@@ -61,6 +61,9 @@ def test_numbers_of_detectable() -> None:
         for who, suffix in (("alone", "_alone"), ("with one more", "")):
             sizes = [f"{meters.loc[meter, name + suffix]:.2f}" for name in names]
             assert cells(f"{meter}, {who}") == sizes
+            learned = ("undetected", "found", "unavoidable")
+            sizes = [f"{meters.loc[meter, name + suffix]:.2f}" for name in learned]
+            assert cells(f"{meter}, {who}, learned") == sizes
     customers = found.customers.set_index("customer")
     for name in ("LV1.101 Load 13", "LV1.101 Load 2"):
         errors = [f"{customers.loc[name, column]:.2f}" for column in ("error", "error_fits")]
