@@ -298,8 +298,8 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
 def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
     """Go on with the likeliest model of the loads, where no explanation of weight needs a meter.
 
-    The filter becomes that of the rival, with the powers of the best explanation unknown since the onset. The
-    detector starts anew. The state is unchanged where meters are doubted.
+    The filter becomes that of the rival. The powers of the best explanation, unknown since the onset, become
+    errors of the loads. The detector starts anew. The state is unchanged where meters are doubted.
 
     Parameters
     ----------
@@ -316,7 +316,8 @@ def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
     if chosen.any():
         whole = after.full or full.expanded(rival.modes, after, rival.static)
         W, std = core.faults.W[:, chosen], found.problems[int(found.model[0])].std[chosen]
-        after = replace(after, full=replay.freed(rival.modes, whole, rival.joint(), W, std))
+        joint = rival.joint()
+        after = replace(after, full=replay.freed(rival.modes, whole, joint, W, std, loads=True))
     parts = after, rival.static, detector.start(core.modes)
     return CoreState(*parts, rival.update, History((*parts, ())), (), state.masked)
 
