@@ -21,11 +21,11 @@ power: loads without a report move neighbours alike as well. Sets with amounts a
 own, with one amount for all (`Common`): one amount at a time, none of them is worth its penalty.
 
 **Rivals.** Loads may change in ways that no report shows. The search is also made under each model of
-`gridsec.estimators.modal.rivals`, with the cost of that model by itself; a model that is far from the best one
-is not explored further. A set without meter j is looked for from the best set by removing j. The sets that
-differ by one whole group are tried, and those that differ by one meter from each of the likeliest sets. All
-sets met count with the weight exp(-cost / 2). A meter is named if the sets without it have together less than
-`DOUBT` of the weight.
+`gridsec.estimators.modal.rivals`, with the cost of that model by itself. A model that is far from the best
+one is not explored further. A set without meter j is looked for from the best set by removing j. The sets
+that differ by one whole group are tried, and those that differ by one meter from each of the likeliest sets.
+All sets met count with the weight exp(-cost / 2). A meter is named if the sets without it have together less
+than `DOUBT` of the weight.
 
 References
 ----------
