@@ -543,11 +543,11 @@ def search(
     found = []
     for end, sets, best, cost in zip(ends, one_amount, least, more, strict=True):
         if best < min(least) + HOPELESS:
-            each = _explored(end, sets, groups, batches)
+            met = _explored(end, sets, groups, batches)
         else:
-            each = {end.chosen.tobytes(): end.cost}
-            _with_amounts_alike(end.problem, each, sets[:1])
-        found.append({key: value + cost for key, value in each.items()})
+            met = {end.chosen.tobytes(): end.cost}
+            _with_amounts_alike(end.problem, met, sets[:1])
+        found.append({key: value + cost for key, value in met.items()})
     return _identified(tuple(end.problem for end in ends), tuple(found))
 
 
