@@ -298,8 +298,8 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
 def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
     """Go on with the likeliest model of the loads, where no explanation of weight needs a meter.
 
-    The filter becomes that of the rival, with the powers of the best explanation unknown since the onset. The
-    detector starts anew. The state is unchanged where meters are doubted.
+    The filter becomes that of the rival. The powers of the best explanation, unknown since the onset, become
+    errors of the loads. The detector starts anew. The state is unchanged where meters are doubted.
 
     Parameters
     ----------
@@ -309,17 +309,41 @@ def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
         The explanations after the same tick.
     """
     found, p = suspicion.found, core.modes.size
-    free = ~found.chosen[:, :p].any(axis=1)
-    if not free[0] or float(found.weight[~free].sum()) >= DOUBT or not state.rivals:
+    if found.chosen[0, :p].any() or doubted(found, p) >= DOUBT or not state.rivals:
         return state
     rival = state.rivals[int(found.model[0])]
     after, chosen = rival.filter, found.chosen[0]
     if chosen.any():
         whole = after.full or full.expanded(rival.modes, after, rival.static)
         W, std = core.faults.W[:, chosen], found.problems[int(found.model[0])].std[chosen]
-        after = replace(after, full=replay.freed(rival.modes, whole, rival.joint(), W, std))
+        joint = rival.joint()
+        after = replace(after, full=replay.freed(rival.modes, whole, joint, W, std, loads=True))
     parts = after, rival.static, detector.start(core.modes)
     return CoreState(*parts, rival.update, History((*parts, ())), (), state.masked)
+
+
+def doubted(found: Identification, meters: int) -> float:
+    """Weight of the explanations that need a meter: without their meters they weigh less.
+
+    A meter that is off by less than can be seen is part of many explanations, and no reason to doubt.
+
+    Parameters
+    ----------
+    found
+        The explanations.
+    meters
+        Number of meters.
+    """
+    every = zip(found.model.tolist(), found.chosen, found.weight.tolist(), strict=True)
+    weight = {(model, chosen.tobytes()): each for model, chosen, each in every}
+    out = 0.0
+    for (model, key), each in weight.items():
+        chosen = np.frombuffer(key, dtype=np.bool_).copy()
+        if chosen[:meters].any():
+            chosen[:meters] = False
+            if weight.get((model, chosen.tobytes()), 0.0) < each:
+                out += each
+    return out
 
 
 def _elsewhere(evidence: Evidence, pinned: list[int]) -> bool:
@@ -358,9 +382,9 @@ class Suspicion:
 def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     """Sets of faults that explain the readings, since the onset that suits them best.
 
-    The search is made at the likeliest onset. The costs of what it finds are then compared at the pinned
-    onsets, and where another one is cheaper, the search is made there. Where readings are missing, only the
-    pinned onsets are searched, with exact scores.
+    The search is made at the likeliest onset, under the model of the loads and its rivals. The costs of what
+    it finds are then compared at the pinned onsets, and where another one is cheaper, the search is made
+    there. Where readings are missing, only the pinned onsets are searched, with exact scores.
 
     Parameters
     ----------
