@@ -16,8 +16,8 @@ on, or has a fixed error before learning, with 5 or 30 % of the powers unread, w
 
 Loads with meters of class 0.5 %, 0.1 V and 0.05 %, groups with white errors of 0.2 %. Columns: runs with an
 honest meter named, honest meters ever named, manipulated meters named at the end of those that there are,
-ticks evaluated without an alarm after the onset, %, and mean time of an identification. Exits 1 when an honest
-meter is named.
+ticks evaluated without an alarm after the onset, %, and mean time of an identification. Exits 1 when an
+honest meter is named.
 """
 
 from __future__ import annotations

@@ -309,8 +309,7 @@ def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
         The explanations after the same tick.
     """
     found, p = suspicion.found, core.modes.size
-    free = ~found.chosen[:, :p].any(axis=1)
-    if not free[0] or float(found.weight[~free].sum()) >= DOUBT or not state.rivals:
+    if found.chosen[0, :p].any() or doubted(found, p) >= DOUBT or not state.rivals:
         return state
     rival = state.rivals[int(found.model[0])]
     after, chosen = rival.filter, found.chosen[0]
@@ -320,6 +319,30 @@ def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
         after = replace(after, full=replay.freed(rival.modes, whole, rival.joint(), W, std))
     parts = after, rival.static, detector.start(core.modes)
     return CoreState(*parts, rival.update, History((*parts, ())), (), state.masked)
+
+
+def doubted(found: Identification, meters: int) -> float:
+    """Weight of the explanations that need a meter: without their meters they weigh less.
+
+    A meter that is off by less than can be seen is part of many explanations, and no reason to doubt.
+
+    Parameters
+    ----------
+    found
+        The explanations.
+    meters
+        Number of meters.
+    """
+    every = zip(found.model.tolist(), found.chosen, found.weight.tolist(), strict=True)
+    weight = {(model, chosen.tobytes()): each for model, chosen, each in every}
+    out = 0.0
+    for (model, key), each in weight.items():
+        chosen = np.frombuffer(key, dtype=np.bool_).copy()
+        if chosen[:meters].any():
+            chosen[:meters] = False
+            if weight.get((model, chosen.tobytes()), 0.0) < each:
+                out += each
+    return out
 
 
 def _elsewhere(evidence: Evidence, pinned: list[int]) -> bool:

@@ -414,7 +414,7 @@ def together(groups: Sequence[Ints]) -> Groups:
     out, sizes = [], np.array([each.size for each in groups])
     class_of = np.ceil(np.log2(np.maximum(sizes, 1)))
     for one in np.unique(class_of):
-        some = [groups[k] for k in np.flatnonzero(class_of == one)]
+        some = [groups[k] for k in np.flatnonzero(class_of == one).tolist()]
         members = np.zeros((len(some), max(each.size for each in some)), dtype=np.intp)
         inside = np.zeros(members.shape, dtype=np.bool_)
         for k, each in enumerate(some):

@@ -78,8 +78,15 @@ def test_the_first_of_the_rivals_is_the_model() -> None:
 STEPS_OF_PLACES = np.vstack([np.zeros((1, 12)), STEPS])
 
 
-@pytest.mark.parametrize("kind", ["complete", "random"])
-@pytest.mark.parametrize("liar", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "liar"),
+    [
+        ("complete", False),
+        ("random", True),
+        pytest.param("complete", True, marks=pytest.mark.acceptance),
+        pytest.param("random", False, marks=pytest.mark.acceptance),
+    ],
+)
 def test_loads_that_jump_accuse_no_honest_meter(kind: str, liar: bool) -> None:
     """Five cars of 11 kW, each for a minute: none is named but a meter that is off by 2 %."""
     kernel = core.assemble(MODEL, STEPS_OF_PLACES, np.full(12, 0.1), gamma=1e6)
@@ -102,3 +109,40 @@ def test_loads_that_jump_accuse_no_honest_meter(kind: str, liar: bool) -> None:
             assert not named[np.arange(12) != LIAR].any()
     assert alarms
     assert named[LIAR] == liar
+
+
+@pytest.mark.parametrize("missing", [False, True])
+def test_a_load_that_no_report_shows_is_adopted(missing: bool) -> None:
+    """11 kW for good at the root: the alarm ends, and the voltages at all meters are those with the load."""
+    kernel = core.assemble(MODEL, STEPS_OF_PLACES, np.full(12, 0.1), gamma=1e6)
+    source, state = Source(MODEL, np.random.default_rng(1)), core.init(kernel, 0.0)
+    seen = np.arange(12) != 11 if missing else None
+    alarms = adopted = 0
+    for k in range(130):
+        m = source.tick() + STEPS[:, 0] * (-0.11 if k >= 60 else 0.0)
+        state, evidence = core.step(kernel, state, float(k), m, seen)
+        if core.alarmed(kernel, evidence):
+            alarms += 1
+            suspicion = core.identify(kernel, state, evidence)
+            assert not suspicion.found.named.any()
+            after = core.adopt(kernel, state, suspicion)
+            adopted += after is not state
+            state = after
+    assert alarms
+    assert 1 <= adopted <= 3
+    assert not core.alarmed(kernel, evidence)
+    found, at = core.estimate(kernel, state), MODEL.meters
+    off = found.mean[at] - source.w - STEPS[:, 0] * -0.11
+    # The fixed error of the busbar's meter is common to all.
+    assert (np.abs(off) < 4.0 * np.sqrt(found.variance[at] + MODEL.busbar + MODEL.fixed)).all()
+
+
+def test_no_load_is_adopted_while_a_meter_is_doubted() -> None:
+    """A meter that is off by 5 %: the state stays."""
+    kernel = core.assemble(MODEL, STEPS_OF_PLACES, np.full(12, 0.1), gamma=1e6)
+    source, state = Source(MODEL, np.random.default_rng(1)), core.init(kernel, 0.0)
+    for k in range(100):
+        m = source.tick() + 0.1 * (k >= 80) * np.eye(12)[LIAR]
+        state, evidence = core.step(kernel, state, float(k), m)
+    suspicion = core.identify(kernel, state, evidence)
+    assert core.adopt(kernel, state, suspicion) is state

@@ -151,6 +151,21 @@ def test_costs_of_one_amount_are_exact(seed: int) -> None:
         assert common.cost == pytest.approx(exact(common.inside), abs=1e-8)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_group_that_is_off_by_one_amount_is_one_hypothesis(seed: int) -> None:
+    """Twelve neighbours of 48, each hardly beyond noise: the descent ends at them, or at a cheaper set."""
+    random, p = np.random.default_rng(seed), 48
+    groups = tuple(np.arange(k, k + n) for n in (2, 3, 6, 12) for k in range(0, p, n))
+    F = np.linalg.inv(0.5 * np.eye(p) + 0.02)
+    f = np.where(np.arange(p) // 12 == 2, 2.0, 0.0)
+    y = F @ f + np.linalg.cholesky(F) @ random.standard_normal(p)
+    given, truth = SearchProblem(y, F, np.ones(p), p, np.zeros(p), np.full(p, np.inf)), f > 0.0
+    found = s.in_common(given, groups, np.zeros(p, dtype=np.bool_))
+    assert s.costs(given, found, s.ALIKE).min() <= s.costs(given, truth[None], s.ALIKE)[0] + 1e-9
+    assert s.costs(given, truth[None], s.ALIKE)[0] < s.cost(given, truth)
+    assert not (s.search(given, groups).named & ~truth).any()
+
+
 def test_large_faults_are_named_and_nothing_else() -> None:
     """Three of nine, far beyond noise: these and no others."""
     for seed in range(4):
