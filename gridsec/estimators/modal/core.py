@@ -298,8 +298,8 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
 def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
     """Go on with the likeliest model of the loads, where no explanation of weight needs a meter.
 
-    The filter becomes that of the rival, with the powers of the best explanation unknown since the onset. The
-    detector starts anew. The state is unchanged where meters are doubted.
+    The filter becomes that of the rival. The powers of the best explanation, unknown since the onset, become
+    errors of the loads. The detector starts anew. The state is unchanged where meters are doubted.
 
     Parameters
     ----------
@@ -316,7 +316,8 @@ def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
     if chosen.any():
         whole = after.full or full.expanded(rival.modes, after, rival.static)
         W, std = core.faults.W[:, chosen], found.problems[int(found.model[0])].std[chosen]
-        after = replace(after, full=replay.freed(rival.modes, whole, rival.joint(), W, std))
+        joint = rival.joint()
+        after = replace(after, full=replay.freed(rival.modes, whole, joint, W, std, loads=True))
     parts = after, rival.static, detector.start(core.modes)
     return CoreState(*parts, rival.update, History((*parts, ())), (), state.masked)
 
@@ -381,8 +382,9 @@ class Suspicion:
 def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     """Sets of faults that explain the readings, since the onset that suits them best.
 
-    The search is made at the likeliest onset. The costs of what it finds are then compared at the pinned
-    onsets, and where another one is cheaper, the search is made there. Where readings are missing, only the
+    The search is made at the likeliest onset, under the model of the loads and its rivals. Where the model
+    suits best, the costs of what it finds are then compared at the pinned onsets, and where another one is
+    cheaper, the search is made there. Where readings are missing, only the
     pinned onsets are searched, with exact scores.
 
     Parameters
@@ -394,6 +396,8 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     rows = [] if state.suspected else [int(evidence.rows[0])]
     rows = list(dict.fromkeys(rows + np.flatnonzero(test.pinned & test.onsets.used).tolist()))
     found = _searched(core, state, rows[0])
+    if found.model[0]:
+        return Suspicion(rows[0], found)
     std = found.problems[0].std
     costs = [
         cost(replace(_problem(core, _joint(core, _parts(state), row)), std=std), found.chosen[0])

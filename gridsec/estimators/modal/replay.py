@@ -198,7 +198,9 @@ def follow(modes: Modes, before: Suspected, innovation: Innovation, h: float) ->
     )
 
 
-def freed(modes: Modes, full: Full, joint: Joint, W: Floats, std: Floats) -> Full:
+def freed(  # the filter, and the faults
+    modes: Modes, full: Full, joint: Joint, W: Floats, std: Floats, *, loads: bool = False
+) -> Full:
     """The exact filter with the amounts of some faults unknown since the onset; O(t^2 f).
 
     With y, F and X of these faults and ``G = X (F + 1 / s^2)^-1``, the means lose ``G y``, and P gains
@@ -214,8 +216,12 @@ def freed(modes: Modes, full: Full, joint: Joint, W: Floats, std: Floats) -> Ful
         Columns of the faults in the modes.
     std : (f,)
         Prior standard deviations of their amounts.
+    loads
+        The faults are errors of the loads: from now on they are part of w, ``X_w - W`` in place of ``X_w``.
     """
     y, F = joint.of(W)
     X = np.vstack([modes.back @ joint.shift[0] @ W, modes.back @ joint.shift[1] @ W])
+    if loads:
+        X[: modes.size] -= joint.level * (modes.back @ W)
     gain = np.linalg.solve(F + np.diag(std**-2.0), X.T).T
     return replace(full, mean=full.mean - (gain @ y).reshape(2, -1), cov=full.cov + gain @ X.T)

@@ -17,13 +17,15 @@ meters' faults is then estimated from the set found, and the descent is repeated
 
 A set of meters that are off by nearly the same amount needs one size instead of k. The likelihood of a set is
 the mean of that with independent amounts and that with amounts alike, which has the charge of a false
-power: loads without a report move neighbours alike as well.
+power: loads without a report move neighbours alike as well. Sets with amounts alike have a descent of their
+own, with one amount for all (`Common`): one amount at a time, none of them is worth its penalty.
 
-**Rivals.** Loads may change at once in ways that no report shows. With a change of the loads of the
-covariance ``SHOCK S`` integrated out, which is diagonal in the modes, the search is made a second time; its
-sets bear the cost of that change. A set without meter j is looked for from the best set by removing j, and
-the sets that differ by one whole group are tried. All sets met count with the weight exp(-cost / 2). A
-meter is named if the sets without it have together less than `DOUBT` of the weight.
+**Rivals.** Loads may change in ways that no report shows. The search is also made under each model of
+`gridsec.estimators.modal.rivals`, with the cost of that model by itself. A model that is far from the best
+one is not explored further. A set without meter j is looked for from the best set by removing j. The sets
+that differ by one whole group are tried, and those that differ by one meter from each of the likeliest sets.
+All sets met count with the weight exp(-cost / 2). A meter is named if the sets without it have together less
+than `DOUBT` of the weight.
 
 References
 ----------

@@ -103,7 +103,10 @@ def test_a_freed_filter_equals_the_dense_one_with_unknown_faults(make: object, k
         now, whole = replay.replayed(made, state.history, onsets, [0])[0].joint(made), state.filter.full
     whole = full.expanded(made, state.filter, state.static) if whole is None else whole
     freed = replay.freed(made, whole, now, made.U.T[:, faults], np.ones(3))
-    merged = np.kron([[1, 0, 0], [0, 1, 1]], np.eye(p))
-    mean, cov = merged @ dense.mean[: 3 * p], merged @ dense.cov[: 3 * p, : 3 * p] @ merged.T
-    assert np.allclose(freed.mean.ravel(), mean, atol=1e-6 * np.abs(mean).max())
-    assert np.allclose(freed.cov, cov, atol=1e-6 * np.abs(cov).max())
+    of_loads = replay.freed(made, whole, now, made.U.T[:, faults], np.ones(3), loads=True)
+    for found, part in ((freed, 0.0), (of_loads, 1.0)):
+        merged = np.kron([[1, 0, 0], [0, 1, 1]], np.eye(p))
+        merged = np.hstack([merged, part * np.vstack([np.eye(p), np.zeros((p, p))])[:, faults]])
+        mean, cov = merged @ dense.mean, merged @ dense.cov @ merged.T
+        assert np.allclose(found.mean.ravel(), mean, atol=1e-6 * np.abs(mean).max())
+        assert np.allclose(found.cov, cov, atol=1e-6 * np.abs(cov).max())
