@@ -382,10 +382,9 @@ class Suspicion:
 def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     """Sets of faults that explain the readings, since the onset that suits them best.
 
-    The search is made at the likeliest onset, under the model of the loads and its rivals. Where the model
-    suits best, the costs of what it finds are then compared at the pinned onsets, and where another one is
-    cheaper, the search is made there. Where readings are missing, only the
-    pinned onsets are searched, with exact scores.
+    The search is made at the likeliest onset, under the model of the loads and its rivals. The costs of what
+    it finds are then compared at the pinned onsets, and where another one is cheaper, the search is made
+    there. Where readings are missing, only the pinned onsets are searched, with exact scores.
 
     Parameters
     ----------
@@ -396,8 +395,6 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     rows = [] if state.suspected else [int(evidence.rows[0])]
     rows = list(dict.fromkeys(rows + np.flatnonzero(test.pinned & test.onsets.used).tolist()))
     found = _searched(core, state, rows[0])
-    if found.model[0]:
-        return Suspicion(rows[0], found)
     std = found.problems[0].std
     costs = [
         cost(replace(_problem(core, _joint(core, _parts(state), row)), std=std), found.chosen[0])

@@ -60,7 +60,7 @@ ALIKE = 0.99
 """Share of the variance of amounts that meters have in common where they are manipulated alike, 1."""
 SOME = 200
 """Number of sets that are also tried with amounts alike, the cheapest ones first."""
-HOPELESS = 60.0
+HOPELESS = 30.0
 """Cost above the best of all from which on a model of the loads is not explored further, 1."""
 NEAR, EXPANDED = 10.0, 6
 """Cost above the best one up to which the sets beside a set are looked at as well, and their number."""
@@ -543,11 +543,11 @@ def search(
     found = []
     for end, sets, best, cost in zip(ends, one_amount, least, more, strict=True):
         if best < min(least) + HOPELESS:
-            each = _explored(end, sets, groups, batches)
+            met = _explored(end, sets, groups, batches)
         else:
-            each = {end.chosen.tobytes(): end.cost}
-            _with_amounts_alike(end.problem, each, sets[:1])
-        found.append({key: value + cost for key, value in each.items()})
+            met = {end.chosen.tobytes(): end.cost}
+            _with_amounts_alike(end.problem, met, sets[:1])
+        found.append({key: value + cost for key, value in met.items()})
     return _identified(tuple(end.problem for end in ends), tuple(found))
 
 
