@@ -1,6 +1,6 @@
 """Whether the sequential monitor and the exact bank name the same meters.
 
-    python -m benchmarks.agreement [scenarios]
+    python -m benchmarks.agreement [scenarios] [estimator]
 
 Random minutes on the feeders that are small enough for the bank with M = 2 (CIGRE LV, SimBench rural 1,
 Kerber Landnetz): any time of the fourteen days, no meter, one or two meters manipulated by bias, scaling or
@@ -78,11 +78,11 @@ def compare(
     return verdicts, {int(j) for attack in what.attacks for j in attack.meters}
 
 
-def main(count: int) -> int:
+def main(count: int, estimator: str = SEQUENTIAL) -> int:
     """Compare; 1 if one of them ever names an honest meter."""
     sites = [choose(load(name), max_attacked=2) for name in FEEDERS]
     both = [
-        (design(choose(site, estimator=SEQUENTIAL)), design(choose(site, estimator=DIRECT))) for site in sites
+        (design(choose(site, estimator=estimator)), design(choose(site, estimator=DIRECT))) for site in sites
     ]
     tally: Counter[str] = Counter()
     wrong = 0
@@ -111,4 +111,5 @@ def main(count: int) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(arguments(__doc__, scenarios=1000).scenarios))
+    asked = arguments(__doc__, scenarios=1000, estimator=SEQUENTIAL)
+    sys.exit(main(asked.scenarios, asked.estimator))

@@ -1,6 +1,6 @@
 """Days without an attack on every feeder and in every season: how often the monitor raises an alarm.
 
-    python -m benchmarks.clean_days [days] [--rate R]
+    python -m benchmarks.clean_days [days] [--rate R] [--estimator NAME] [--feeder NAME ...]
 
 Thirty days by default, shared evenly between all feeders and the four seasons. Every run
 has its own seed (meters, loads, clouds, busbar) and begins at an hour of the season's profiles drawn at
@@ -34,6 +34,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 from scipy.stats import poisson
 
+from feeders.format.columns import ESTIMATORS
 from feeders.model.site import Site, from_tables, load, names
 from feeders.profiles import Season, library
 from feeders.simulation.scenario import START, Scenario, SimulatedReading, simulate
@@ -91,7 +92,9 @@ class Seen:
         self.notes += other.notes
 
 
-def plan(name: str, season: Season, number: int, span_s: float, rate: float | None) -> Run:
+def plan(  # noqa: PLR0917  # what one run is of
+    name: str, season: Season, number: int, span_s: float, rate: float | None, estimator: str | None = None
+) -> Run:
     """One run of `span_s`, the `number`-th of all."""
     tables = load(name).tables
     own = tables.meta.monitor
@@ -102,6 +105,7 @@ def plan(name: str, season: Season, number: int, span_s: float, rate: float | No
         silence_s=max(own.silence_s, 3.0 * tick_s),
         commission_s=SOONER * span_s if sum(divmod(number, len(Season))) % 2 else own.commission_s,
         alarms_per_year=own.alarms_per_year if rate is None else rate,
+        estimator=own.estimator if estimator is None else estimator,
     )
     site = from_tables(replace(tables, meta=replace(tables.meta, monitor=settings)))
     hours = library(season).t_s.size // 4
@@ -185,9 +189,9 @@ def row(name: str, season: str, begins: str, seen: Seen) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def main(days: float, rate: float | None) -> int:
+def main(days: float, rate: float | None, estimator: str | None, feeders: list[str] | None) -> int:
     """Play all runs, print, and judge."""
-    cells = list(product(names(balanced=False), Season))
+    cells = list(product(feeders or names(balanced=False), Season))
     span_s = DAY_S * days / len(cells)
     shares = (f"{decision} %" for decision in Decision)
     counts = ("suspected", "false alarms", "true alarms", "truth s", "monitor s")
@@ -195,7 +199,7 @@ def main(days: float, rate: float | None) -> int:
     print("| " + " | ".join(head) + " |\n|" + "---|" * len(head), flush=True)
     total, asked = Seen(), 0.0
     for number, (name, season) in enumerate(cells):
-        run = plan(name, season, number, span_s, rate)
+        run = plan(name, season, number, span_s, rate, estimator)
         seen = play(run)
         day, hour = divmod(run.scenario.profile_s / 3600.0, 24.0)
         weekday = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")[int(day) % 7]
@@ -214,5 +218,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Days without an attack.")
     parser.add_argument("days", nargs="?", type=float, default=30.0, help="simulated days in total")
     parser.add_argument("--rate", type=float, help="alarms per feeder and year asked for")
+    parser.add_argument("--estimator", choices=ESTIMATORS, help="estimator in place of that of the files")
+    parser.add_argument("--feeder", action="append", choices=names(balanced=False), help="these feeders only")
     given = parser.parse_args()
-    sys.exit(main(given.days, given.rate))
+    sys.exit(main(given.days, given.rate, given.estimator, given.feeder))

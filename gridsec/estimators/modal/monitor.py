@@ -180,6 +180,11 @@ class ModalState:
     kept: Record | None
 
     @property
+    def attack_kinds(self) -> AttackKinds:
+        """Reading history and kinds of the manipulations."""
+        return self.front.attack_kinds
+
+    @property
     def commission(self) -> ModalCommission:
         """Learned errors and the time of commissioning."""
         return ModalCommission(self.front.learned, self.front.learning, self.kept)

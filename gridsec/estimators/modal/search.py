@@ -532,8 +532,8 @@ def search(
     batches = together(groups)
     start = relevant(problem)
     ends = [_descended(problem, (np.zeros_like(start), start), batches)]
-    for each, _ in rivals:
-        ends.append(_descended(each, (np.zeros_like(start), ends[0].chosen), batches))
+    for other, _ in rivals:
+        ends.append(_descended(other, (np.zeros_like(start), ends[0].chosen), batches))
     one_amount = [in_common(end.problem, groups, end.chosen) for end in ends]
     more = (0.0, *(cost for _, cost in rivals))
     least = [

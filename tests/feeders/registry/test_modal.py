@@ -192,6 +192,7 @@ def test_an_unread_power_leaves_the_voltage_open_and_accuses_nobody() -> None:
     assert (verdict.decision, verdict.cause) == (Decision.UNDECIDED, Cause.MISSING_POWERS)
 
 
+@pytest.mark.acceptance
 def test_a_stuck_meter_is_masked_while_it_repeats_itself() -> None:
     """Readings that do not change beyond chance name the meter, by the same test as the default monitor."""
     frames, _ = played(0.0)

@@ -74,7 +74,8 @@ def test_a_replay_gives_the_same_reports(
     """To the last bit, with late, lost and repeated readings."""
     _, told = served
     some = [one for one in readings if START <= one.t < START + END_S]
-    reports = [json.loads(json.dumps(to_json(each.report))) for each in replay(site, iter(some), ReplayCounts())]
+    results = list(replay(site, iter(some), ReplayCounts()))
+    reports = [json.loads(json.dumps(to_json(each.report))) for each in results]
     same = {report["t"]: report for report in reports}
     assert len(told.estimates) > END_S - 10
     for report in told.estimates:
