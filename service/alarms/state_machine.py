@@ -165,7 +165,6 @@ __all__ = [
     "carry",
     "close",
     "conditions",
-    "first_id",
     "from_json",
     "hold",
     "restore",
@@ -393,15 +392,6 @@ def alarm_id(condition: Condition, onset: float) -> str:
     """
     what = "\0".join((condition.kind, condition.feeder, condition.subject or "", repr(onset)))
     tail = int.from_bytes(hashlib.sha256(what.encode()).digest()[:10], "big")
-    return _text_of(onset, tail)
-
-
-def first_id(t: float) -> str:
-    """Return the smallest id of an alarm with an onset at or after a time, to the millisecond."""
-    return _text_of(t, 0)
-
-
-def _text_of(onset: float, tail: int) -> str:
     number = (max(0, int(onset * 1000.0)) % (1 << 48)) << 80 | tail
     return "".join(_CROCKFORD[number >> shift & 31] for shift in range(125, -1, -5))
 

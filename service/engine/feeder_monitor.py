@@ -200,7 +200,7 @@ class FeederMonitor:
         self.skipped = 0
         self.defect: Exception | None = None
         self._alarm_rules = alarm_rules(site, rules)
-        self._display: displayed.Display | None = None
+        self._display: displayed.Display[FeederReport] | None = None
         self._data_errors = DataErrors(site)
         self._power_ages = PowerAges(site)
         self._watcher: registry.DesignedEstimator | None = None
@@ -298,7 +298,7 @@ class FeederMonitor:
         self.report, self._display = self._complete(self._judge(tick))
         return TickResult(self.report, ())
 
-    def _complete(self, report: FeederReport) -> tuple[FeederReport, displayed.Display]:
+    def _complete(self, report: FeederReport) -> tuple[FeederReport, displayed.Display[FeederReport]]:
         """The report with revision, newest tick with a reading, and start and display of the verdict."""
         before = self.report
         last = None if before is None else before.t_measured
@@ -308,7 +308,11 @@ class FeederMonitor:
         measured = (last if last is None or last <= report.t else None) if report.model_only else report.t
         display = displayed.advance(self._display, self._alarm_rules, report)
         complete = replace(
-            report, revision=self.revision, t_measured=measured, since=since, displayed=display.shown
+            report,
+            revision=self.revision,
+            t_measured=measured,
+            since=since,
+            displayed=displayed.shown(display),
         )
         return complete, display
 

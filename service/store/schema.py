@@ -206,6 +206,10 @@ def _add_distrust(connection: sa.Connection) -> None:
     DISTRUST.create(connection)
 
 
+def _add_rollup(connection: sa.Connection) -> None:
+    ROLLUP.create(connection)
+
+
 def digest(meters: str) -> str:
     """Return the lookup key of a layout."""
     return hashlib.sha256(meters.encode()).hexdigest()
@@ -225,10 +229,6 @@ def _add_digest(connection: sa.Connection) -> None:
 
 def _add_writer(connection: sa.Connection) -> None:
     WRITER.create(connection)
-
-
-def _add_rollup(connection: sa.Connection) -> None:
-    ROLLUP.create(connection)
 
 
 MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (

@@ -1,14 +1,14 @@
 // Assembly of the page: selection of the feeder, its live states, and the freshness of the data.
 
 import { Alarms } from "./alarms.js";
-import { Banner, offline } from "./banner.js";
 import { Commissioning } from "./commissioning.js";
 import { showDetail } from "./detail.js";
 import { Diagram } from "./diagram.js";
 import { bare, busbarWords, byId, clock, duration, el, getJson, isKnown, signed, status } from "./dom.js";
 import { Fleet, worstFirst } from "./fleet.js";
-import { Series } from "./series.js";
 import { session } from "./session.js";
+import { Banner, offline } from "./banner.js";
+import { Series } from "./series.js";
 
 const API = "/api/v1/feeders";
 const KEPT = 600;
@@ -23,17 +23,18 @@ const alarms = new Alarms({
     if (customer) select(customer.customer);
   },
   onLink: (up) => { page.alarmsLinked = up; },
-  onSeries: async (alarm) => {
-    if (alarm.feeder !== page.feeder?.name) await show(alarm.feeder);
-    if (alarm.feeder !== page.feeder?.name) return;
-    series.open([alarm.meter], around(alarm));
-  },
 });
 
 const fleet = new Fleet({ onPick: (name) => show(name), onChange: (attacked) => { page.others = attacked; title(); } });
 const series = new Series({ onChange: () => address() });
 const banner = new Banner({ onSelect: (id) => select(id), onSeries: (meters) => series.open(meters) });
 const commissioning = new Commissioning({ onChange: () => detail() });
+
+alarms.onSeries = async (alarm) => {
+  if (alarm.feeder !== page.feeder?.name) await show(alarm.feeder);
+  if (alarm.feeder !== page.feeder?.name) return;
+  series.open([alarm.meter], around(alarm));
+};
 
 // Address of the page: the feeder, and the shown time series.
 function address(name = page.feeder?.name) {

@@ -20,6 +20,7 @@ from service.cli.doctor import Finding, Level
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import session
 from service.store import Store
+from service.store.backup import NEWEST
 from tests.service.commands import command
 from tests.service.databases import Cluster
 from tests.service.running import FEEDER, free_port
@@ -89,7 +90,7 @@ def test_a_machine_in_order(tmp_path: Path, monkeypatch: Patch, capsys: Capture)
         *("version", "database", "disk", "clock", "http", "zenoh", "feeder", "descriptors", "optional")
     ]
     assert not [line for lines in found.values() for line in lines if line[0] == "FAIL"]
-    assert "schema version 6" in found["database"][0][1]
+    assert f"schema version {NEWEST}" in found["database"][0][1]
     assert found["clock"][0][1].endswith("s after the newest tick of the database")
     assert found["http"] == [("ok", f"127.0.0.1:{http} is free")]
     assert found["zenoh"][1] == ("ok", f"{zenoh} answers")

@@ -21,7 +21,7 @@ from service.cli.simulate import Pace, play
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import MeterClient
 from service.store import Store, StoreUnavailable
-from service.store.backup import backup, restore
+from service.store.backup import NEWEST, backup, restore
 from tests.service.databases import Cluster, both
 from tests.service.running import FEEDER, free_port, until
 from tests.service.stored import T0, a_report, an_alarm, raised
@@ -77,7 +77,7 @@ def test_alarms_survive_kill_9_and_restore(tmp_path: Path) -> None:
             history = httpx.get(f"{url}/api/v1/feeders/{FEEDER}/history").json()["points"]
             done = gridsec("backup", str(file), "--database", database)
             assert (done.returncode, done.stderr) == (0, "")
-            assert done.stdout == f"{file}: {file.stat().st_size} bytes, schema version 6\n"
+            assert done.stdout == f"{file}: {file.stat().st_size} bytes, schema version {NEWEST}\n"
             refused = gridsec("restore", str(file), "--database", database)
             assert refused.returncode == 4
             assert "another process writes it; stop the service first" in refused.stderr
