@@ -27,6 +27,13 @@ export const signed = (value, digits = 1) =>
   known(value) ? `${value > 0 ? "+" : ""}${minus(value.toFixed(digits))}` : "–";
 export const isKnown = known;
 
+// Name of a meter: its id, then its customer. Ids that are the same stand once; a customer without a meter alone.
+export function deviceName(meter, customer) {
+  const owner = customer && /^\d/.test(customer) ? `customer ${customer}` : customer;
+  if (!meter || !customer || meter === customer) return meter || owner || "";
+  return `${meter} · ${owner}`;
+}
+
 export function duration(seconds) {
   const s = Math.max(0, Math.round(seconds));
   if (s < 120) return `${s} s`;
