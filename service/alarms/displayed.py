@@ -13,6 +13,7 @@ Time is an argument. The first tick, and a tick that is not after the last one, 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Generic, Protocol, TypeVar
 
 from gridsec.interface import Cause, Decision
 from service.alarms.state_machine import AlarmKind, AlarmRules
@@ -22,11 +23,35 @@ _UNHEARD = frozenset({Cause.SILENT_METERS, Cause.NO_BUSBAR})
 """Causes of missing readings; the meters may not be silent yet."""
 
 
+class Judged(Protocol):
+    """Tick with a verdict, such as `FeederReport`."""
+
+    @property
+    def t(self) -> float:
+        """Unix time, s."""
+
+    @property
+    def verdict(self) -> Decision:
+        """Raw verdict."""
+
+    @property
+    def cause(self) -> Cause:
+        """Its cause."""
+
+    @property
+    def skipped(self) -> int:
+        """Number of skipped ticks directly before."""
+
+
+T = TypeVar("T", bound=Judged)
+
+
 @dataclass(frozen=True, slots=True)
-class Display:
+class Display(Generic[T]):
     """State of the displayed verdict of one feeder. A value: `advance` returns a new one."""
 
-    shown: DisplayedVerdict
+    newest: T  # newest tick with the displayed verdict
+    since: float  # first tick of the time that led to it, Unix s
     t: float  # time of the last tick, Unix s
     answer: Decision | None = None  # other verdict than the displayed one, CLEAN or ATTACKED, that waits
     onset: float = 0.0  # its first tick, Unix s
@@ -34,76 +59,73 @@ class Display:
     held: bool = False  # its clock stands still since an undecided tick
     undecided_since: float | None = None  # first of the undecided ticks up to the last one, Unix s
 
+    @property
+    def verdict(self) -> Decision:
+        """Displayed verdict."""
+        return self.newest.verdict
 
-def advance(display: Display | None, rules: AlarmRules, report: FeederReport) -> Display:
+
+def advance(display: Display[T] | None, rules: AlarmRules, tick: T) -> Display[T]:
     """Update the displayed verdict by one tick; None before the first one."""
-    if display is None or report.t <= display.t:
-        return Display(_shown(report, report.t), report.t, undecided_since=_no_answer(report, report.t))
-    if report.verdict is Decision.UNDECIDED:
-        after = _undecided(display, rules, report)
+    if display is None or tick.t <= display.t:
+        no_answer = tick.t if tick.verdict is Decision.UNDECIDED else None
+        return Display(tick, tick.t, tick.t, undecided_since=no_answer)
+    if tick.verdict is Decision.UNDECIDED:
+        after = _undecided(display, rules, tick)
     else:
-        after = _decided(display, rules, report)
-    return replace(after, t=report.t)
+        after = _decided(display, rules, tick)
+    return replace(after, t=tick.t)
 
 
-def _decided(display: Display, rules: AlarmRules, report: FeederReport) -> Display:
-    """The display after a tick with an answer."""
-    display = replace(display, undecided_since=None)
-    if report.verdict is display.shown.verdict:
-        return replace(display, shown=_shown(report, display.shown.since), answer=None, held=False)
-    if display.answer is not report.verdict:
-        display = replace(display, answer=report.verdict, onset=report.t, lasted_s=0.0)
-    else:
-        display = _ticked(display, report)
-    display = replace(display, held=False)
-    kind = AlarmKind.METER_MANIPULATED
-    delay = rules.on(kind) if report.verdict is Decision.ATTACKED else rules.off(kind)
-    return _change(display, report, display.onset) if display.lasted_s >= delay else display
-
-
-def _undecided(display: Display, rules: AlarmRules, report: FeederReport) -> Display:
-    """The display after a tick without an answer."""
-    since = report.t if display.undecided_since is None else display.undecided_since
-    # The answer of a tick counts until the next one.
-    display = replace(_ticked(display, report), held=True, undecided_since=since)
-    lasted = report.t - since
-    due = lasted >= rules.on(AlarmKind.UNDECIDED) and (
-        report.cause not in _UNHEARD or lasted > rules.silence_s
-    )
-    if display.shown.verdict is not Decision.UNDECIDED:
-        return _change(display, report, since) if due else display
-    starts_again = due and display.answer is Decision.CLEAN
-    return replace(
-        display,
-        shown=_shown(report, display.shown.since),
-        answer=None if starts_again else display.answer,
-    )
-
-
-def _ticked(display: Display, report: FeederReport) -> Display:
-    """The display with the clock of the waiting answer moved to this tick, unless it stands still."""
-    if display.answer is None or display.held or report.skipped:
-        return display
-    return replace(display, lasted_s=display.lasted_s + report.t - display.t)
-
-
-def _change(display: Display, report: FeederReport, since: float) -> Display:
-    """The display of another verdict."""
-    return replace(display, shown=_shown(report, since), answer=None)
-
-
-def _no_answer(report: FeederReport, t: float) -> float | None:
-    return t if report.verdict is Decision.UNDECIDED else None
-
-
-def _shown(report: FeederReport, since: float) -> DisplayedVerdict:
-    """The verdict of a report as displayed."""
+def shown(display: Display[FeederReport]) -> DisplayedVerdict:
+    """Return the displayed verdict for a report."""
+    report = display.newest
     return DisplayedVerdict(
         verdict=report.verdict,
-        since=since,
+        since=display.since,
         t=report.t,
         cause=report.cause,
         reason=report.reason,
         suspects=report.suspects,
         inverters=tuple(inverter.customer for inverter in report.inverters if inverter.suspect),
     )
+
+
+def _decided(display: Display[T], rules: AlarmRules, tick: T) -> Display[T]:
+    """The display after a tick with an answer."""
+    display = replace(display, undecided_since=None)
+    if tick.verdict is display.verdict:
+        return replace(display, newest=tick, answer=None, held=False)
+    if display.answer is not tick.verdict:
+        display = replace(display, answer=tick.verdict, onset=tick.t, lasted_s=0.0)
+    else:
+        display = _ticked(display, tick)
+    display = replace(display, held=False)
+    kind = AlarmKind.METER_MANIPULATED
+    delay = rules.on(kind) if tick.verdict is Decision.ATTACKED else rules.off(kind)
+    return _change(display, tick, display.onset) if display.lasted_s >= delay else display
+
+
+def _undecided(display: Display[T], rules: AlarmRules, tick: T) -> Display[T]:
+    """The display after a tick without an answer."""
+    since = tick.t if display.undecided_since is None else display.undecided_since
+    # The answer of a tick counts until the next one.
+    display = replace(_ticked(display, tick), held=True, undecided_since=since)
+    lasted = tick.t - since
+    due = lasted >= rules.on(AlarmKind.UNDECIDED) and (tick.cause not in _UNHEARD or lasted > rules.silence_s)
+    if display.verdict is not Decision.UNDECIDED:
+        return _change(display, tick, since) if due else display
+    starts_again = due and display.answer is Decision.CLEAN
+    return replace(display, newest=tick, answer=None if starts_again else display.answer)
+
+
+def _ticked(display: Display[T], tick: T) -> Display[T]:
+    """The display with the clock of the waiting answer moved to this tick, unless it stands still."""
+    if display.answer is None or display.held or tick.skipped:
+        return display
+    return replace(display, lasted_s=display.lasted_s + tick.t - display.t)
+
+
+def _change(display: Display[T], tick: T, since: float) -> Display[T]:
+    """The display of another verdict."""
+    return replace(display, newest=tick, since=since, answer=None)

@@ -184,7 +184,6 @@ __all__ = [
     "close",
     "commented",
     "conditions",
-    "first_id",
     "from_json",
     "hold",
     "restore",
@@ -417,17 +416,9 @@ def alarm_id(condition: Condition, onset: float) -> str:
     return ulid(onset, condition.kind, condition.feeder, condition.subject or "", repr(onset))
 
 
-def first_id(t: float) -> str:
-    """Return the smallest id of an alarm with an onset at or after a time, to the millisecond."""
-    return _text_of(t, 0)
-
-
 def ulid(t: float, *parts: str) -> str:
     """Return an id in the form of a ULID, with a hash of the parts instead of random bits."""
-    return _text_of(t, int.from_bytes(hashlib.sha256("\0".join(parts).encode()).digest()[:10], "big"))
-
-
-def _text_of(t: float, tail: int) -> str:
+    tail = int.from_bytes(hashlib.sha256("\0".join(parts).encode()).digest()[:10], "big")
     number = (max(0, int(t * 1000.0)) % (1 << 48)) << 80 | tail
     return "".join(_CROCKFORD[number >> shift & 31] for shift in range(125, -1, -5))
 

@@ -208,7 +208,7 @@ class FeederMonitor:
         self.skipped = 0
         self.defect: Exception | None = None
         self._alarm_rules = alarm_rules(site, rules)
-        self._display: displayed.Display | None = None
+        self._display: displayed.Display[FeederReport] | None = None
         self._data_errors = DataErrors(site)
         self._power_ages = PowerAges(site)
         # Meters that have had no reading since the start and are not silent yet.
@@ -339,7 +339,7 @@ class FeederMonitor:
                 self._connecting.discard(BUSBAR)
         return bool(self._connecting)
 
-    def _complete(self, report: FeederReport) -> tuple[FeederReport, displayed.Display]:
+    def _complete(self, report: FeederReport) -> tuple[FeederReport, displayed.Display[FeederReport]]:
         """The report with revision, newest tick with a reading, and start and display of the verdict."""
         before = self.report
         last = None if before is None else before.t_measured
@@ -349,7 +349,11 @@ class FeederMonitor:
         measured = (last if last is None or last <= report.t else None) if report.model_only else report.t
         display = displayed.advance(self._display, self._alarm_rules, report)
         complete = replace(
-            report, revision=self.revision, t_measured=measured, since=since, displayed=display.shown
+            report,
+            revision=self.revision,
+            t_measured=measured,
+            since=since,
+            displayed=displayed.shown(display),
         )
         return complete, display
 

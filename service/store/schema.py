@@ -272,6 +272,8 @@ def words_of(alarm: Alarm) -> str:
         alarm.comment,
     )
     return " ".join(part for part in parts if part).lower()
+def _add_rollup(connection: sa.Connection) -> None:
+    ROLLUP.create(connection)
 
 
 def digest(meters: str) -> str:
@@ -293,10 +295,6 @@ def _add_digest(connection: sa.Connection) -> None:
 
 def _add_writer(connection: sa.Connection) -> None:
     WRITER.create(connection)
-
-
-def _add_rollup(connection: sa.Connection) -> None:
-    ROLLUP.create(connection)
 
 
 def _add_incidents(connection: sa.Connection) -> None:

@@ -13,26 +13,19 @@ import math
 import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import sqlalchemy as sa
 import structlog
 
 from service.alarms.incidents import Action, Shelf
-from service.alarms.state_machine import (
-    Alarm,
-    AlarmState,
-    AlarmTransition,
-    Change,
-    first_id,
-    from_json,
-    to_json,
-)
+from service.alarms.state_machine import Alarm, AlarmState, AlarmTransition, Change, from_json, to_json
 from service.report.report import FeederReport
 from service.store import incidents
 from service.store.connect import Connections
 from service.store.incidents import IncidentReader, rank_of, sorted_by, words_in
+from service.store.rollups import AlarmSpan, add_rollups, prune_rollups, read_alarm_spans, read_series
 from service.store.schema import (
     ALARM,
     BAD,
@@ -45,7 +38,6 @@ from service.store.schema import (
     INCIDENT_EVENT,
     LAYOUT,
     OUTBOX,
-    ROLLUP,
     WRITER,
     AlarmEvent,
     CommissioningChange,
@@ -57,21 +49,7 @@ from service.store.schema import (
     migrate,
     words_of,
 )
-from service.store.series import (
-    MAX_ROWS,
-    ROLLUP_S,
-    ROWS_S,
-    Series,
-    bucket_of,
-    floor_to,
-    merge,
-    of_rollups,
-    of_rows,
-    pack,
-    roll_up,
-    rows,
-    unpack,
-)
+from service.store.series import Series, pack, rows, unpack
 from service.store.state_codec import SnapshotKind, StateSnapshot
 
 
@@ -251,25 +229,16 @@ class Reader(IncidentReader):
         `buckets` is the largest number of buckets, extended by one at an end. A longer time than
         `series.ROWS_S` is merged from roll-ups, and from the rows after the newest one.
         """
-        bucket_s = bucket_of(until - since, buckets)
-        begin, end = floor_to(since, bucket_s), -floor_to(-until, bucket_s)
-        first, parts = begin, []
         with self._read() as connection:
-            if until - since > ROWS_S:
-                rolled = _rollups(connection, feeder, begin, end)
-                parts.append(of_rollups(rolled, meters))
-                first = _rolled_until(connection, feeder) or begin
-            rows = _newest_rows(connection, feeder, max(first, begin), end)
-        parts.append(of_rows(rows[-MAX_ROWS:], meters, bucket_s, until))
-        return Series(
-            begin,
-            end,
-            bucket_s,
-            self.history_step_s,
-            tuple(meters),
-            merge(parts, bucket_s),
-            complete=len(rows) <= MAX_ROWS,
-        )
+            return read_series(
+                connection,
+                feeder,
+                meters,
+                since=since,
+                until=until,
+                buckets=buckets,
+                step_s=self.history_step_s,
+            )
 
     def alarm_spans(
         self, feeder: str, *, since: float, until: float, limit: int = 200
@@ -278,31 +247,8 @@ class Reader(IncidentReader):
 
         Returns spans, more: `more` if there are further alarms than the `limit` newest ones.
         """
-        a, e = ALARM.c, EVENT.c
-        overlap = sa.and_(a.feeder == feeder, sa.or_(a.t_cleared.is_(None), a.t_cleared >= since))
-        # Ids begin with the onset: an alarm that returned later keeps its id.
-        chosen = sa.select(a.id).where(overlap, a.id < first_id(until)).order_by(a.id.desc())
         with self._read() as connection:
-            ids = list(connection.scalars(chosen.limit(limit + 1)))
-            changes = sa.select(e.alarm_id, e.t, e.change, e.data).where(
-                e.alarm_id.in_(ids[:limit]), e.change.in_([str(Change.RAISED), str(Change.CLEARED)])
-            )
-            found = connection.execute(changes.order_by(e.seq).limit(_CHANGES_READ)).all()
-        spans: dict[tuple[str, int], AlarmSpan] = {}
-        last: dict[str, AlarmSpan] = {}
-        for alarm_id, t, change, data in found:
-            if change == str(Change.RAISED):
-                last[alarm_id] = AlarmSpan(from_json(json.loads(data)), t, None)
-            elif alarm_id in last:
-                last[alarm_id] = replace(last[alarm_id], cleared=t)
-            if alarm_id in last:
-                spans[alarm_id, last[alarm_id].alarm.count] = last[alarm_id]
-        inside = [
-            span
-            for span in spans.values()
-            if span.raised < until and (span.cleared is None or span.cleared >= since)
-        ]
-        return sorted(inside, key=lambda span: span.raised), len(ids) > limit
+            return read_alarm_spans(connection, feeder, since=since, until=until, limit=limit)
 
     def history_meters(self, feeder: str) -> set[str]:
         """Return the meters of all kept ticks of a feeder."""
@@ -355,50 +301,6 @@ class Reader(IncidentReader):
             )
             for row in reversed(rows)
         ]
-
-
-@dataclass(frozen=True, slots=True)
-class AlarmSpan:
-    """One occurrence of an alarm: the alarm when it was raised, and both times, Unix s."""
-
-    alarm: Alarm
-    raised: float
-    cleared: float | None  # None while it is active
-
-
-_CHANGES_READ = 5000
-"""Largest number of changes that `alarm_spans` reads."""
-
-
-def _rollups(connection: sa.Connection, feeder: str, begin: float, end: float) -> list[dict[str, Any]]:
-    """Roll-ups of a feeder in [begin, end), oldest first."""
-    r = ROLLUP.c
-    query = (
-        sa.select(r.t, r.ticks, r.clean_s, r.attacked_s, r.undecided_s, r.data, LAYOUT.c.meters)
-        .join(LAYOUT, LAYOUT.c.id == r.layout)
-        .where(r.feeder == feeder, r.t >= begin, r.t < end)
-        .order_by(r.t, r.layout)
-    )
-    return [dict(row) for row in connection.execute(query).mappings()]
-
-
-def _rolled_until(connection: sa.Connection, feeder: str) -> float | None:
-    """End of the newest roll-up of a feeder: all rows before it are rolled up. None without one."""
-    newest = connection.scalar(sa.select(sa.func.max(ROLLUP.c.t)).where(ROLLUP.c.feeder == feeder))
-    return None if newest is None else float(newest) + ROLLUP_S
-
-
-def _newest_rows(
-    connection: sa.Connection, feeder: str, begin: float, end: float
-) -> list[tuple[float, str, bytes, tuple[str, ...]]]:
-    """Newest rows of a feeder in [begin, end), oldest first: at most one more than `MAX_ROWS`."""
-    h = HISTORY.c
-    query = sa.select(h.t, h.verdict, h.data, h.layout).where(h.feeder == feeder, h.t >= begin, h.t < end)
-    found = connection.execute(query.order_by(h.t.desc()).limit(MAX_ROWS + 1)).all()
-    numbers = {row.layout for row in found}
-    texts = connection.execute(sa.select(LAYOUT.c.id, LAYOUT.c.meters).where(LAYOUT.c.id.in_(numbers)))
-    meters = {number: tuple(json.loads(text)) for number, text in texts}
-    return [(t, verdict, data, meters[layout]) for t, verdict, data, layout in reversed(found)]
 
 
 def _shelved_by(shelf: Shelf) -> sa.ColumnElement[bool]:
@@ -599,7 +501,7 @@ class Store(Reader):
                     incidents.store(connection, self._connections.insert, grouping)
                     for report in worthy:
                         self._put_history(connection, report)
-                        _roll_up(connection, self._connections.insert, rolled, report)
+                        add_rollups(connection, self._connections.insert, rolled, report)
                     if rejected:
                         _put_rejected(connection, rejected)
                     for item in kept:
@@ -716,11 +618,8 @@ class Store(Reader):
         # The number of rows fits the time limit of a call.
         oldest = sa.select(h.feeder, h.t).where(whose, h.t < report.t - keep).limit(_PRUNED_AT_ONCE)
         connection.execute(HISTORY.delete().where(sa.tuple_(h.feeder, h.t).in_(oldest)))
-        r = ROLLUP.c
-        others = [] if before is None else [r.feeder.not_in([*self._marks, report.feeder])]
-        past = (sa.or_(r.feeder == report.feeder, *others), r.t < report.t - keep - ROLLUP_S)
-        oldest = sa.select(r.feeder, r.t).where(*past).limit(_PRUNED_AT_ONCE)
-        connection.execute(ROLLUP.delete().where(sa.tuple_(r.feeder, r.t).in_(oldest)))
+        others = None if before is None else (*self._marks, report.feeder)
+        prune_rollups(connection, report.feeder, report.t - keep, apart_from=others, limit=_PRUNED_AT_ONCE)
 
     def _layout(self, connection: sa.Connection, report: FeederReport) -> int:
         meters = json.dumps([meter.meter for meter in rows(report)])
@@ -729,45 +628,6 @@ class Store(Reader):
         if known is None:
             known = connection.execute(LAYOUT.insert().values(row).returning(LAYOUT.c.id)).scalar_one()
         return int(known)
-
-
-_ROLLED_AT_ONCE = 20
-"""Largest number of roll-ups that one stored tick adds: after an upgrade, 14 days take 84 minutes."""
-
-
-def _roll_up(connection: sa.Connection, insert: Any, rolled: dict[str, float], report: FeederReport) -> None:
-    """Add the roll-ups of the finished buckets before a report; `rolled` follows."""
-    h, r, feeder = HISTORY.c, ROLLUP.c, report.feeder
-    now = floor_to(report.t, ROLLUP_S)
-    until = rolled.get(feeder)
-    if until is None:
-        until = _rolled_until(connection, feeder)
-    if until is not None and report.t < until:  # The clock was set back.
-        connection.execute(ROLLUP.delete().where(r.feeder == feeder, r.t >= now))
-        until = now
-    if until is not None and now <= until:
-        rolled[feeder] = until
-        return
-    before = sa.and_(h.feeder == feeder, h.t < now, *([] if until is None else [h.t >= until]))
-    first = connection.scalar(sa.select(sa.func.min(h.t)).where(before))
-    if first is None:
-        rolled[feeder] = now
-        return
-    begin = floor_to(float(first), ROLLUP_S)
-    end = min(now, begin + _ROLLED_AT_ONCE * ROLLUP_S)
-    query = (
-        sa.select(h.t, h.verdict, h.layout, h.data, LAYOUT.c.meters)
-        .join(LAYOUT, LAYOUT.c.id == h.layout)
-        .where(h.feeder == feeder, h.t >= begin, h.t < end)
-        .order_by(h.t)
-    )
-    for row in roll_up(connection.execute(query).all(), end):
-        values = {"feeder": feeder, **row}
-        statement = insert(ROLLUP).values(values)
-        connection.execute(
-            statement.on_conflict_do_update(index_elements=["feeder", "t", "layout"], set_=values)
-        )
-    rolled[feeder] = end
 
 
 def _stored_before(connection: sa.Connection, key: int) -> bool:

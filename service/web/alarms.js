@@ -35,7 +35,7 @@ function hint({ data_error: error }) {
 }
 
 export class Alarms {
-  constructor({ onPick, onLink, onSeries, onChange = () => {} }) {
+  constructor({ onPick, onLink, onChange = () => {} }) {
     this.alarms = new Map();
     this.items = new Map();
     this.loading = 0;
@@ -45,7 +45,6 @@ export class Alarms {
     this.turn = 0;
     this.onPick = onPick;
     this.onLink = onLink;
-    this.onSeries = onSeries; // Called with an alarm of a meter.
     this.onChange = onChange; // Called after each change of an alarm.
     this.feeder = null;
     this.source = null;
@@ -229,7 +228,7 @@ export class Alarms {
         el("p", { class: "numbers", text: numbers }),
         alarm.kind === "meter-manipulated" ? hint(e) : null,
         el("p", { class: "quiet since", text: since }),
-        alarm.meter ? el("button", { type: "button", class: "plain", text: "Time series", on: { click: () => this.onSeries(alarm) } }) : null,
+        alarm.meter && this.onSeries ? el("button", { type: "button", class: "plain", text: "Time series", on: { click: () => this.onSeries(alarm) } }) : null,
         answered),
       alarm.acknowledged_by === null
         ? el("button", { type: "button", class: "ack", text: "Acknowledge", on: { click: () => this.ask(alarm) } })

@@ -1,15 +1,15 @@
 // Assembly of the page: selection of the feeder, its live states, and the freshness of the data.
 
 import { Alarms } from "./alarms.js";
-import { Banner, offline } from "./banner.js";
 import { Incidents } from "./incidents.js";
 import { Commissioning } from "./commissioning.js";
 import { showDetail } from "./detail.js";
 import { Diagram } from "./diagram.js";
 import { bare, busbarWords, byId, clock, duration, el, getJson, isKnown, signed, status, volt } from "./dom.js";
 import { Fleet } from "./fleet.js";
-import { Series } from "./series.js";
 import { session } from "./session.js";
+import { Banner, offline } from "./banner.js";
+import { Series } from "./series.js";
 
 const API = "/api/v1/feeders";
 const KEPT = 600;
@@ -25,11 +25,6 @@ const pick = async (feeder, meter, owner) => {
 const alarms = new Alarms({
   onPick: pick,
   onLink: (up) => { page.alarmsLinked = up; },
-  onSeries: async (alarm) => {
-    if (alarm.feeder !== page.feeder?.name) await show(alarm.feeder);
-    if (alarm.feeder !== page.feeder?.name) return;
-    series.open([alarm.meter], around(alarm));
-  },
   onChange: () => incidents.later(),
 });
 const incidents = new Incidents({ alarms, onPick: pick });
@@ -38,6 +33,12 @@ const fleet = new Fleet({ onPick: (name) => show(name), onChange: (attacked) => 
 const series = new Series({ onChange: () => address() });
 const banner = new Banner({ onSelect: (id) => bring(id), onSeries: (meters) => series.open(meters) });
 const commissioning = new Commissioning({ onChange: () => detail() });
+
+alarms.onSeries = async (alarm) => {
+  if (alarm.feeder !== page.feeder?.name) await show(alarm.feeder);
+  if (alarm.feeder !== page.feeder?.name) return;
+  series.open([alarm.meter], around(alarm));
+};
 
 // Address of the page: the feeder, and the shown time series.
 function address(name = page.feeder?.name) {

@@ -45,7 +45,7 @@ function explanationWords({ meters, inverters, powers = [], probability }) {
 }
 
 // Certainty of the displayed verdict, from the numbers of the latest tick.
-function certainty(report, shown) {
+function certainty(report, shown, name) {
   const judged = report.meters.filter((m) => m.seen && isKnown(m.score) && isKnown(m.threshold) && m.threshold > 0);
   const ratio = (m) => m.score / m.threshold;
   const times = (value) => (value >= 10 ? String(Math.round(value)) : value.toFixed(1));
@@ -56,14 +56,14 @@ function certainty(report, shown) {
     const strongest = named.reduce((a, b) => (ratio(b) > ratio(a) ? b : a));
     const rivals = report.explanations?.length ? ` Explanations: ${report.explanations.slice(0, 3).map(explanationWords).join(", ")}.` : "";
     const much = ratio(strongest) > 1
-      ? `Strongest evidence at this tick: ${strongest.meter}, ${times(ratio(strongest))} times the largest score of an honest meter.`
-      : `Named by earlier readings; at this tick the largest score is ${percent(ratio(strongest))} of its threshold (${strongest.meter}).`;
+      ? `Strongest evidence at this tick: ${name(strongest.meter)}, ${times(ratio(strongest))} times the largest score of an honest meter.`
+      : `Named by earlier readings; at this tick the largest score is ${percent(ratio(strongest))} of its threshold (${name(strongest.meter)}).`;
     return `${much}${rivals}`;
   }
   if (shown.verdict === "clean") {
     if (!judged.length) return `${tested} at this tick.`;
     const largest = judged.reduce((a, b) => (ratio(b) > ratio(a) ? b : a));
-    return `${tested}; largest score ${percent(ratio(largest))} of its threshold (${largest.meter}).`;
+    return `${tested}; largest score ${percent(ratio(largest))} of its threshold (${name(largest.meter)}).`;
   }
   if (report.explanations?.length) return `Possible: ${report.explanations.slice(0, 3).map(explanationWords).join(", or ")}.`;
   return `No answer: neither an attack nor its absence is established. ${tested}.`;
@@ -82,6 +82,10 @@ export class Banner {
     this.all = false; // All suspects are listed.
     this.offsets = new Map(); // Newest deviation of each suspect, V: an undecided tick may have none.
     this.feeder = null;
+  }
+
+  name(meter) {
+    return deviceName(meter, this.feeder.layout.customers.find((c) => c.meter === meter)?.customer);
   }
 
   decision(kind, word) {
@@ -130,7 +134,7 @@ export class Banner {
     const since = isKnown(shown.since) ? `Since ${clock(shown.since)} (${duration(report.t - shown.since)}).` : "";
     const now = raw ? ` Latest tick: ${report.verdict}, ${report.cause.replaceAll("-", " ")}.` : "";
     byId("since").textContent = `${since}${now}`.trim();
-    byId("certainty").textContent = certainty(report, shown);
+    byId("certainty").textContent = certainty(report, shown, (meter) => this.name(meter));
     this.next(stepOf(report, shown));
     this.chips(report, shown);
     this.facts(report, shown, range);
@@ -150,11 +154,11 @@ export class Banner {
     const accused = new Set([...shown.suspects, ...shown.inverters]);
     const candidates = shown.verdict === "undecided" ? (report.explanations ?? []).flatMap((e) => [...e.meters, ...e.inverters]) : [];
     const every = [
-      ...shown.suspects.map((m) => chip("suspect", `${deviceName(m, customer.get(m))}${off(m)}`, () => go(m))),
+      ...shown.suspects.map((m) => chip("suspect", `${this.name(m)}${off(m)}`, () => go(m))),
       ...shown.inverters.map((c) => chip("suspect", `inverter of ${c}${kvar(c)}`, () => this.onSelect(c))),
       ...[...new Set(candidates)].filter((one) => !accused.has(one)).map((one) =>
-        chip("doubtful", `candidate ${deviceName(one, customer.get(one))}`, () => (customer.has(one) || one === "substation" ? go(one) : this.onSelect(one)))),
-      ...report.silent.map((s) => chip("silent", `${deviceName(s.meter, customer.get(s.meter))} silent ${isKnown(s.seconds) ? duration(s.seconds) : ""}`, () => go(s.meter))),
+        chip("doubtful", `candidate ${this.name(one)}`, () => (customer.has(one) || one === "substation" ? go(one) : this.onSelect(one)))),
+      ...report.silent.map((s) => chip("silent", `${this.name(s.meter)} silent ${isKnown(s.seconds) ? duration(s.seconds) : ""}`, () => go(s.meter))),
     ];
     const rest = every.length - SHOWN;
     const more = rest > 0

@@ -1,7 +1,7 @@
 // Time series of meters: reported and reconstructed voltage with its uncertainty band, verdicts and alarms.
 // One panel per meter over a common time axis; minimum and maximum of each pixel column.
 
-import { bare, byId, clock, duration, el, getJson, isKnown, nominals, svg, volt } from "./dom.js";
+import { bare, byId, clock, deviceName, duration, el, getJson, isKnown, nominals, svg, volt } from "./dom.js";
 
 const API = "/api/v1/feeders";
 const BUSBAR = "substation";
@@ -213,7 +213,7 @@ export class Series {
   // Id of a meter, then its customer.
   name(meter) {
     const customer = this.feeder.layout.customers.find((c) => c.meter === meter)?.customer;
-    return meter === BUSBAR ? "substation · busbar meter" : customer && customer !== meter ? `${meter} · ${customer}` : meter;
+    return meter === BUSBAR ? "substation · busbar meter" : deviceName(meter, customer);
   }
 
   add(meter) {

@@ -15,6 +15,7 @@ from feeders.simulation.plant import Channel
 from feeders.simulation.recording import read_recording, record
 from feeders.simulation.scenario import Scenario
 from gridsec.interface import Cause, Decision
+from service.alarms import displayed
 from service.alarms.displayed import Display, advance
 from service.alarms.state_machine import AlarmBook, AlarmKind, AlarmRules, conditions
 from service.alarms.state_machine import advance as advance_alarms
@@ -34,57 +35,59 @@ def tick(t: float, letter: str) -> FeederReport:
     return report
 
 
-def shown(letters: str, rules: AlarmRules = RULES) -> str:
+def letters_of(letters: str, rules: AlarmRules = RULES) -> str:
     """Displayed verdicts, by the first letter, at ticks of one second."""
     display, found = None, ""
     for k, letter in enumerate(letters):
         display = advance(display, rules, tick(T0 + k, letter))
-        found += str(display.shown.verdict)[0].upper()
+        found += str(display.verdict)[0].upper()
     return found
 
 
 def test_each_verdict_is_displayed_after_its_delay() -> None:
-    assert shown("CCCAAAA") == "CCCCCAA"
-    assert shown("AAACCCCCCC") == "AAAAAAAACC"
-    assert shown("CCCUUUU") == "CCCCCUU"
+    assert letters_of("CCCAAAA") == "CCCCCAA"
+    assert letters_of("AAACCCCCCC") == "AAAAAAAACC"
+    assert letters_of("CCCUUUU") == "CCCCCUU"
     # Readings are missing: longer than the silence, not equal to it.
-    assert shown("CSSSSSSS") == "CCCCCCUU"
-    assert shown("UUCCCCCCCC") == "UUUUUUUCCC"
+    assert letters_of("CSSSSSSS") == "CCCCCCUU"
+    assert letters_of("UUCCCCCCCC") == "UUUUUUUCCC"
     immediate = AlarmRules(on_delay_s=0.0, off_delay_s=0.0, silence_s=0.0)
-    assert shown("CACUCA", immediate) == "CACUCA"
+    assert letters_of("CACUCA", immediate) == "CACUCA"
 
 
 def test_lost_readings_do_not_change_it() -> None:
-    assert set(shown("CSCSSCSSSC" * 20)) == {"C"}
-    assert set(shown("ASASSASSSA" * 20)) == {"A"}
+    assert set(letters_of("CSCSSCSSSC" * 20)) == {"C"}
+    assert set(letters_of("ASASSASSSA" * 20)) == {"A"}
     # An attack is displayed although every other tick has no answer: its clock stands still there.
-    assert shown("C" + "AS" * 4) == "CCCCCAAAA"
+    assert letters_of("C" + "AS" * 4) == "CCCCCAAAA"
     # CLEAN between long times without an answer is not enough.
-    assert set(shown("U" + "CSSSSSS" * 20)) == {"U"}
-    assert shown("U" + "CS" * 6)[-1] == "C"
+    assert set(letters_of("U" + "CSSSSSS" * 20)) == {"U"}
+    assert letters_of("U" + "CS" * 6)[-1] == "C"
 
 
 def test_the_shown_reason_and_suspects_belong_to_the_shown_verdict() -> None:
     display = advance(None, RULES, tick(T0, "A"))
     for k, letter in enumerate("CSU", start=1):
         display = advance(display, RULES, tick(T0 + k, letter))
-    assert (display.shown.verdict, display.shown.suspects, display.shown.t) == ("attacked", ("m0",), T0)
+    now = displayed.shown(display)
+    assert (now.verdict, now.suspects, now.t) == ("attacked", ("m0",), T0)
     for k in range(4, 12):
         display = advance(display, RULES, tick(T0 + k, "C"))
-    assert (display.shown.verdict, display.shown.suspects) == ("clean", ())
+    now = displayed.shown(display)
+    assert (now.verdict, now.suspects) == ("clean", ())
     # Its first tick came before the undecided ones.
-    assert (display.shown.since, display.shown.t) == (T0 + 1, T0 + 11)
+    assert (now.since, now.t) == (T0 + 1, T0 + 11)
 
 
 def test_skipped_ticks_and_a_clock_set_back() -> None:
     display = advance(None, RULES, tick(T0, "C"))
     display = advance(display, RULES, tick(T0 + 1, "A"))
     display = advance(display, RULES, replace(tick(T0 + 60, "A"), skipped=58))
-    assert display.shown.verdict is Decision.CLEAN
+    assert display.verdict is Decision.CLEAN
     display = advance(display, RULES, tick(T0 + 62, "A"))
-    assert display.shown.verdict is Decision.ATTACKED
+    assert display.verdict is Decision.ATTACKED
     display = advance(display, RULES, tick(T0 - 50, "C"))
-    assert (display.shown.verdict, display.shown.since) == (Decision.CLEAN, T0 - 50)
+    assert (display.verdict, display.since) == (Decision.CLEAN, T0 - 50)
 
 
 letters = st.text("ACUS", min_size=1, max_size=60)
@@ -94,7 +97,7 @@ letters = st.text("ACUS", min_size=1, max_size=60)
 @given(letters)
 def test_the_page_and_the_alarm_list_agree(sequence: str) -> None:
     """When the alarm of a manipulation rises, ATTACKED is displayed; when it clears, CLEAN is."""
-    display: Display | None = None
+    display: Display[FeederReport] | None = None
     book = AlarmBook("village")
     for k, letter in enumerate(sequence):
         report = tick(T0 + k, letter)
@@ -103,8 +106,8 @@ def test_the_page_and_the_alarm_list_agree(sequence: str) -> None:
         book, transitions = advance_alarms(book, RULES, conditions(report), report.t)
         for one in transitions:
             if one.alarm.kind is AlarmKind.METER_MANIPULATED:
-                assert display.shown.verdict is (Decision.ATTACKED if one.alarm.active else Decision.CLEAN)
-        assert display.shown.since <= display.shown.t <= report.t
+                assert display.verdict is (Decision.ATTACKED if one.alarm.active else Decision.CLEAN)
+        assert display.since <= display.newest.t <= report.t
 
 
 @settings(max_examples=60)
@@ -112,7 +115,7 @@ def test_the_page_and_the_alarm_list_agree(sequence: str) -> None:
 def test_no_answer_never_stays_behind_another_verdict(sequence: str) -> None:
     """A lasting verdict is displayed after its delay, and two changes are more than the shorter one apart."""
     every = sequence + sequence[-1] * 8
-    found = shown(every)
+    found = letters_of(every)
     assert found[-1] == {"S": "U"}.get(every[-1], every[-1])
     changes = [k for k, (a, b) in enumerate(pairwise(found), start=1) if a != b]
     assert all(b - a > RULES.on_delay_s for a, b in pairwise(changes))

@@ -187,7 +187,7 @@ def test_old_roll_ups_are_deleted_with_their_rows(tmp_path: Path) -> None:
 
 def test_the_cost_of_a_series_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without roll-ups the oldest rows are left out, and the series states it."""
-    monkeypatch.setattr("service.store.store.MAX_ROWS", 50)
+    monkeypatch.setattr("service.store.rollups.MAX_ROWS", 50)
     draw = np.random.default_rng(4)
     reports = [a_report(BEGIN + k, draw) for k in range(100)]
     with Store(f"sqlite:///{tmp_path}/g.db", history=FINE) as store:
