@@ -314,8 +314,8 @@ function table() {
 
 byId("unselect").addEventListener("click", () => select(null));
 byId("replaced").addEventListener("click", () => {
-  const { meter } = page.feeder.layout.customers.find((c) => c.customer === page.selected);
-  commissioning.ask(meter);
+  const { meter, customer } = page.feeder.layout.customers.find((c) => c.customer === page.selected);
+  commissioning.ask(meter, customer);
 });
 byId("meters-box").addEventListener("toggle", table);
 addEventListener("hashchange", () => {
