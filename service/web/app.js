@@ -320,8 +320,8 @@ byId("detail-series").addEventListener("click", () => {
 });
 byId("unselect").addEventListener("click", () => select(null));
 byId("replaced").addEventListener("click", () => {
-  const { meter } = page.feeder.layout.customers.find((c) => c.customer === page.selected);
-  commissioning.ask(meter);
+  const { meter, customer } = page.feeder.layout.customers.find((c) => c.customer === page.selected);
+  commissioning.ask(meter, customer);
 });
 byId("meters-box").addEventListener("toggle", table);
 addEventListener("hashchange", () => {

@@ -1,6 +1,6 @@
 // Commissioning: a line for the feeder, numbers for a meter, and the dialogue for a replaced meter.
 
-import { byId, getJson, isKnown, signed } from "./dom.js";
+import { byId, deviceName, getJson, isKnown, signed } from "./dom.js";
 import { session } from "./session.js";
 
 const API = "/api/v1/feeders";
@@ -91,9 +91,9 @@ export class Commissioning {
     return ["Own error", `${signed(found.error_volt, 2)} V`, `± ${found.error_volt_std.toFixed(2)} V${since}`];
   }
 
-  ask(meter) {
+  ask(meter, customer) {
     this.asking = meter;
-    byId("renew-what").textContent = `Meter ${meter} of ${this.feeder}: its own error is deleted and learned again, `
+    byId("renew-what").textContent = `Meter ${deviceName(meter, customer)} of ${this.feeder}: its own error is deleted and learned again, `
       + `over ${hours(this.known.needed_s)} h. The other meters stay unchanged.`;
     session.ask("renew-who");
     byId("renew-reason").value = "";

@@ -11,7 +11,7 @@ const HOLD_S = 60; // Time for which a branch stays open after its last suspect,
 const ROOM = [44, 72]; // Least distance of customers with labels, and of their rows, px.
 const OPENED = 30; // Customers of a branch that open at once; those behind stay collapsed.
 const MARGIN = 34; // Least distance of a visible suspect from the edge of the window, px.
-const PHONE = 620; // Width of a narrow window, px.
+const MANY = 300; // Number of customers beyond which colours change at once.
 
 // Shapes around (0, 0): the status of a customer must be readable without colour.
 const SHAPE = {
@@ -143,8 +143,14 @@ export class Diagram {
     };
   }
 
+  standingKey() {
+    const { shown, beyond } = this.standing();
+    return `${[...shown]} | ${[...beyond]}`;
+  }
+
   places() {
     const window = this.window();
+    this.stood = this.standingKey();
     if (this.view === "map") return mapPlaces(this.feeder.layout, window);
     return onePlaces(this.feeder.layout, window, { ...this.standing(), whole: this.whole });
   }
@@ -152,6 +158,7 @@ export class Diagram {
   // Draw again if other branches collapse now.
   relayout() {
     if (this.view === "map" || !this.feeder) return;
+    if (this.stood === this.standingKey()) return; // The same customers stand out.
     const places = this.places();
     if (this.signature(places) !== this.signature(this.placed)) this.build(places);
   }
@@ -193,13 +200,14 @@ export class Diagram {
       svg("path", { class: "shape", d: SHAPE.suspect }), svg("text", { class: "sign", y: 5, text: SIGN.suspect }), svg("text", { class: "note loud", x: 17, y: 4 }));
     spots.append(this.liar);
     this.spots = spots;
-    this.world = svg("g", { class: "world" }, casing, wires, spots);
+    this.world = svg("g", { class: this.customers.size > MANY ? "world many" : "world" }, casing, wires, spots);
     this.root = svg("svg", { width: window.width, height, role: "group", "aria-label": places.title, "aria-describedby": "meters-title" }, this.world);
     this.box.replaceChildren(this.root);
     this.box.classList.toggle("map", this.view === "map");
     byId("zoom").hidden = false;
     this.viewport.open(places.world, { width: window.width, height });
-    this.hover(null);
+    this.hovered = null;
+    this.tip.hidden = true;
     this.paint();
     this.aim();
     if (focused) this.order[0]?.group.focus();
@@ -299,7 +307,7 @@ export class Diagram {
     this.sizes = { quiet, loud };
     this.world.classList.toggle("named", gap * k >= ROOM[0] && pitch * k >= ROOM[1] && !this.placed.upright);
     this.world.classList.toggle("thin", k < 0.6);
-    this.hover(null);
+    if (this.hovered) this.hover(this.hovered);
     this.waiting ??= requestAnimationFrame(() => { this.waiting = null; this.label(); });
   }
 

@@ -31,6 +31,7 @@ export class Fleet {
     this.word = null;
     this.nodes = new Map();
     this.turn = 0;
+    this.goal = null; // Row that gets the focus as soon as it is drawn.
     byId("fleet-all").addEventListener("toggle", () => this.refresh());
     byId("fleet-filter").addEventListener("input", () => this.search());
     byId("fleet-scroll").addEventListener("scroll", () => this.scrolled());
@@ -189,6 +190,11 @@ export class Fleet {
       ...gap(open ? this.total - start - shown.length : 0, "below"),
     ]);
     if (focused && document.activeElement === document.body) this.nodes.get(focused)?.node.querySelector("button").focus();
+    const goal = this.goal === null ? null : byId("fleet-rows").querySelector(`tr[aria-rowindex="${this.goal + 2}"] button`);
+    if (goal) {
+      this.goal = null;
+      goal.focus({ preventScroll: !this.long });
+    }
   }
 
   // The worst feeders and the shown one, with their verdicts.
@@ -243,19 +249,15 @@ export class Fleet {
   }
 
   // Arrow keys walk through all rows, also those that are not loaded yet.
-  async key(event) {
+  key(event) {
     const row = event.target.closest("tr[data-feeder]");
     const last = (this.long ? this.total : Math.min(SHOWN, this.head.length)) - 1;
     const now = Number(row?.getAttribute("aria-rowindex")) - 2;
     const next = { ArrowDown: now + 1, ArrowUp: now - 1, Home: 0, End: last }[event.key];
     if (!row || next === undefined) return;
     event.preventDefault();
-    const k = Math.min(last, Math.max(0, next));
-    const find = () => byId("fleet-rows").querySelector(`tr[aria-rowindex="${k + 2}"] button`);
-    if (!find()) {
-      byId("fleet-scroll").scrollTop = k * rowHeight() - byId("fleet-scroll").clientHeight / 2;
-      await this.load().catch(() => {});
-    }
-    find()?.focus();
+    this.goal = Math.min(last, Math.max(0, next));
+    this.render();
+    if (this.goal !== null) byId("fleet-scroll").scrollTop = this.goal * rowHeight() - byId("fleet-scroll").clientHeight / 2; // Loads the rows there.
   }
 }
