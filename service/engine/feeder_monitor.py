@@ -25,19 +25,11 @@ from gridsec.interface import Cause
 from service.alarms.conditions import conditions
 from service.alarms.state_machine import AlarmBook, AlarmRules, AlarmTransition, advance, hold
 from service.engine.commissioning import FeederCommissioning
-from service.ingest.align import Aligner, AlignRules, Clock, ReadingOutcome, Tick, rules
-from service.ingest.reading import Known, Reading
+from service.ingest.align import Aligner, AlignRules, Clock, Placed, ReadingOutcome, Tick, rules
+from service.ingest.reading import Known, Reading, Readings
 from service.report import feeder_info
-from service.report.report import (
-    DataErrors,
-    FeederReport,
-    blind,
-    build,
-    busbar_phases,
-    snapshot,
-    with_data_error,
-    with_learning,
-)
+from service.report.report import DataErrors, FeederReport, busbar_phases, snapshot
+from service.report.tick_state import TickState
 from service.store.state_codec import KeptInvalid, StateSnapshot, decode_distrust, encode_distrust
 
 
@@ -121,8 +113,13 @@ class Phase(StrEnum):
 class TickResult:
     """Result of one tick."""
 
-    report: FeederReport
+    state: TickState
     transitions: tuple[AlarmTransition, ...]
+
+    @property
+    def report(self) -> FeederReport:
+        """Its report."""
+        return self.state.report
 
 
 def known_of(site: Site) -> Known:
@@ -130,7 +127,7 @@ def known_of(site: Site) -> Known:
     meta = site.tables.meta
     nominal = zip(site.meter_ids, site.customer_nominal[site.meters].tolist(), strict=True)
     own = {meter: volt for meter, volt in nominal if volt != meta.voltage_volt}
-    return Known(frozenset(site.meter_ids), meta.voltage_volt, POWER_MAX_FACTOR * meta.base_kva, own)
+    return Known(site.meter_ids, meta.voltage_volt, POWER_MAX_FACTOR * meta.base_kva, own)
 
 
 def align_rules(
@@ -167,7 +164,7 @@ class FeederMonitor:
     """Monitor of one feeder.
 
     phase, problem: state of the monitor, and the reason of a failure.
-    report: the latest report, or None before the first tick.
+    latest: result of the latest tick, or None before the first one.
     pending: ticks that are due and not evaluated, oldest first.
     skipped: number of skipped ticks.
     defect: error that ended the monitor, until it is logged; None without one.
@@ -194,7 +191,7 @@ class FeederMonitor:
         self.suspicions = suspicions or Suspicions(site)
         self.phase = Phase.DESIGNING
         self.problem = ""
-        self.report: FeederReport | None = None
+        self.latest: TickState | None = None
         self.pending: deque[Tick] = deque()
         self.skipped = 0
         self.defect: Exception | None = None
@@ -203,6 +200,11 @@ class FeederMonitor:
         self._power_ages = PowerAges(site)
         self._watcher: registry.DesignedEstimator | None = None
         self._state: Any = None
+
+    @property
+    def report(self) -> FeederReport | None:
+        """The latest report, or None before the first tick."""
+        return None if self.latest is None else self.latest.report
 
     @property
     def patience_s(self) -> float:
@@ -240,6 +242,12 @@ class FeederMonitor:
         outcome, ticks = self.aligner.take(reading, now)
         self.pending.extend(ticks)
         return outcome
+
+    def place_all(self, readings: Readings) -> Placed:
+        """Align readings in the order of their arrival; ticks that become due are pending."""
+        placed = self.aligner.take_all(readings)
+        self.pending.extend(placed.ticks)
+        return placed
 
     def reach(self, now: float) -> None:
         """Add the ticks that are due without a new reading to the pending ones."""
@@ -286,34 +294,36 @@ class FeederMonitor:
             book = hold(book, tick.t - tick.skipped * self.aligner.rules.tick_s)
         for _ in range(2):  # monitored, then failed
             try:
-                report = self._complete(self._judge(tick))
-                after, transitions = advance(book, self._alarm_rules, conditions(report), report.t)
+                state = self._complete(self._judge(tick))
+                notable = state.notable({subject for _, subject in book.entries})
+                found = [] if notable is None else conditions(notable)
+                after, transitions = advance(book, self._alarm_rules, found, state.t)
             except Exception as error:  # noqa: BLE001 - ticks before and after keep their verdicts
                 self.break_down(error)
             else:
-                self.report, self.book = report, after
-                return TickResult(report, transitions)
-        self.report = self._complete(self._judge(tick))
-        return TickResult(self.report, ())
+                self.latest, self.book = state, after
+                return TickResult(state, transitions)
+        self.latest = self._complete(self._judge(tick))
+        return TickResult(self.latest, ())
 
-    def _complete(self, report: FeederReport) -> FeederReport:
-        """The report with its feeder's revision, the newest tick with a reading, and the verdict's start."""
-        before = self.report
+    def _complete(self, state: TickState) -> TickState:
+        """The result with its feeder's revision, the newest tick with a reading, and the verdict's start."""
+        before = self.latest
         last = None if before is None else before.t_measured
-        goes_on = before is not None and before.verdict is report.verdict and before.t < report.t
-        since = before.since if before is not None and goes_on else report.t
+        goes_on = before is not None and before.verdict is state.verdict and before.t < state.t
+        since = before.since if before is not None and goes_on else state.t
         # After the clock was set back, an earlier time of measurement would be in the future.
-        measured = (last if last is None or last <= report.t else None) if report.model_only else report.t
-        return replace(report, revision=self.revision, t_measured=measured, since=since)
+        measured = (last if last is None or last <= state.t else None) if state.model_only else state.t
+        return replace(state, revision=self.revision, t_measured=measured, since=since)
 
-    def _judge(self, tick: Tick) -> FeederReport:
+    def _judge(self, tick: Tick) -> TickState:
         if self._watcher is None:
             if self.phase is Phase.FAILED:
                 cause, reason = Cause.DESIGN_INVALID, f"not monitored: {self.problem}"
             else:
                 cause, reason = Cause.SETTLING, "the design of the monitor is not finished"
-            return blind(self.site, tick, self.max_attacked, cause, reason)
-        if self._state is None or (self.report is not None and tick.t <= self.report.t):
+            return TickState(self.site, tick, self.max_attacked, cause, reason)
+        if self._state is None or (self.latest is not None and tick.t <= self.latest.t):
             # The first tick, or the clock was set back: earlier readings belong to another time.
             begun = self._watcher.init(tick.t, self.commissioning.known)
             self._state = self.suspicions.restore(begun)
@@ -323,6 +333,13 @@ class FeederMonitor:
         self._state, estimate, verdict = self._watcher.step(self._state, frame)
         self.commissioning.follow(self._state, tick.t)
         self.suspicions.follow(self._state, tick.t)
-        report = build(self.site, tick, self.max_attacked, estimate, verdict)
-        report = with_data_error(report, self._data_errors.follow(frame, estimate, verdict))
-        return with_learning(report, self.commissioning.report())
+        return TickState(
+            self.site,
+            tick,
+            self.max_attacked,
+            verdict.cause,
+            estimate=estimate,
+            judgement=verdict,
+            learning=self.commissioning.report(),
+            data_error=self._data_errors.follow(frame, estimate, verdict),
+        )

@@ -180,8 +180,7 @@ class Runtime:
             await asyncio.sleep(0.0 if self._waits else GATHER_S)
             return
         now = self._wall()
-        wakes = [t for monitor in self._engine.monitors.values() if (t := monitor.aligner.wake()) is not None]
-        timeout = min([IDLE_S, *(t - now for t in wakes)])
+        timeout = min(IDLE_S, self._engine.wake - now)
         if timeout > 0.0:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._wake.wait(), timeout)
@@ -393,7 +392,7 @@ class Runtime:
             elif monitor.phase is Phase.FAILED:
                 problems.append(f"feeder {monitor.name}: {monitor.problem}")
             # With `Clock.EVENTS` the time may stand still.
-            told, waits = monitor.report, engine.config.clock is Clock.WALL
+            told, waits = monitor.latest, engine.config.clock is Clock.WALL
             if waits and told is not None and (age := self.age(told)) > monitor.patience_s:
                 problems.append(f"feeder {monitor.name}: the latest report is {age:.0f} s old")
         for name, problem in engine.unloaded.copy().items():

@@ -170,12 +170,12 @@ class Outgoing:
 
     def __init__(self) -> None:
         self.retry_at: float | None = None
-        self._telemetry: deque[tuple[str, bytes]] = deque(maxlen=TELEMETRY_WAITING)
+        self._telemetry: deque[tuple[str, Callable[[], bytes]]] = deque(maxlen=TELEMETRY_WAITING)
         self._events: deque[Publication] = deque()
         self._closing = False
         self._wakeup = threading.Condition()
 
-    def add_telemetry(self, key: str, payload: bytes) -> None:
+    def add_telemetry(self, key: str, payload: Callable[[], bytes]) -> None:
         """Add a value; a full queue drops the oldest."""
         with self._wakeup:
             self._telemetry.append((key, payload))
@@ -196,7 +196,7 @@ class Outgoing:
             self._closing = True
             self._wakeup.notify()
 
-    def next(self) -> Publication | tuple[str, bytes] | None:
+    def next(self) -> Publication | tuple[str, Callable[[], bytes]] | None:
         """Wait for the next item and remove it; events come first. None after the last one."""
         with self._wakeup:
             while True:

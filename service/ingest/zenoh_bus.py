@@ -145,7 +145,7 @@ class Bus:
         self._stack = ExitStack()
         self._threads: list[threading.Thread] = []
         self._outgoing = Outgoing()
-        self._answers: dict[str, bytes] = {}
+        self._answers: dict[str, bytes | Callable[[], bytes]] = {}
         self._answers_lock = threading.Lock()
         self.counts = BusCounts()
         self.failure: str | None = None
@@ -226,10 +226,11 @@ class Bus:
 
     # ---------------------------------------------------------------- out
 
-    def telemetry(self, key: str, payload: bytes) -> None:
+    def telemetry(self, key: str, payload: Callable[[], bytes]) -> None:
         """Publish the newest value of a key, and store it for queries.
 
-        `key` has no prefix; the payload is JSON.
+        `key` has no prefix. `payload` returns JSON; it is called in another thread, for a subscriber or a
+        query.
         """
         with self._answers_lock:
             self._answers[f"{self._prefix}/{key}"] = payload
@@ -278,7 +279,9 @@ class Bus:
                             encoding=JSON,
                             congestion_control=zenoh.CongestionControl.DROP,
                         )
-                    publishers[key].put(value)
+                    if not publishers[key].matching_status.matching:
+                        continue
+                    publishers[key].put(value())
             except zenoh.ZError as error:
                 self.counts.publish_failed += 1
                 self.failure = _first_line(error)
@@ -310,8 +313,10 @@ class Bus:
                 known = tuple(self._answers.items())
             with query:
                 for key, payload in known:
-                    if query.key_expr.intersects(key) and not _reply(query, key, payload):
-                        break
+                    if query.key_expr.intersects(key):
+                        text = payload if isinstance(payload, bytes) else payload()
+                        if not _reply(query, key, text):
+                            break
 
 
 def _well_formed(key: str) -> bool:

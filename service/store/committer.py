@@ -209,8 +209,8 @@ class Publisher(Protocol):
     failure: str | None
     counts: BusCounts
 
-    def telemetry(self, key: str, payload: bytes) -> None:
-        """Publish the newest value of a key."""
+    def telemetry(self, key: str, payload: Callable[[], bytes]) -> None:
+        """Publish the newest value of a key; `payload` is called only if something receives it."""
 
     def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
         """Publish an event that must not be lost; False if the queue is full."""

@@ -60,9 +60,9 @@ class Outlet:
         self.withdrawn: list[str] = []
         self.confirms = confirms
 
-    def telemetry(self, key: str, payload: bytes) -> None:
+    def telemetry(self, key: str, payload: Callable[[], bytes]) -> None:
         assert key == f"{FEEDER}/estimate"
-        self.estimates.append(json.loads(payload))
+        self.estimates.append(json.loads(payload()))
 
     def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
         alarm = json.loads(payload)
