@@ -14,6 +14,7 @@ from gridsec.estimators.sequential import LearningReason, LearningState
 from service.ingest.align import ReadingOutcome
 from service.ingest.queues import BusCounts
 from service.logs import LineLogger
+from service.report.report import LearningReport
 from service.report.tick_state import TickState
 
 _STEP_BUCKETS = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
@@ -65,6 +66,7 @@ class Metrics:
             "gridsec_meters_learning_delayed", "Meters behind schedule, by reason.", ["feeder", "reason"]
         )
         self.alarms = gauge("gridsec_alarms_active", "Active alarms.", ["feeder"])
+        self.shed = gauge("gridsec_feeders_shed", "Feeders that are not monitored because of overload.")
         self.cycle = Histogram(
             "gridsec_cycle_seconds",
             "One round of the runtime: decode, align, estimate, store.",
@@ -123,13 +125,16 @@ class Metrics:
     def count_tick(self, state: TickState, alarms: int) -> None:
         """Count a tick, and show its numbers; `alarms` are the active ones of its feeder.
 
-        Gauges are set when they change. The learning is unchanged at a tick without a monitor.
+        Gauges are set when they change.
         """
         feeder = state.feeder
         self._child(self.ticks, feeder, state.verdict.value).inc()
         gauges = (self.seen, self.suspects, self.alarms)
         self._show(feeder, gauges, (int(np.count_nonzero(state.tick.seen)), len(state.suspects), alarms))
-        learning = state.learning
+        self.count_learning(feeder, state.learning)
+
+    def count_learning(self, feeder: str, learning: LearningReport | None) -> None:
+        """Count a feeder's meters by state and reason of learning; unchanged at a tick without a monitor."""
         if learning is None or self._learning.get(feeder) == (learning.states, learning.reasons):
             return
         self._learning[feeder] = learning.states, learning.reasons
@@ -137,6 +142,10 @@ class Metrics:
             self.learning.labels(feeder, one).set(learning.states.count(one))
         for reason in LearningReason:
             self.delayed.labels(feeder, reason).set(learning.reasons.count(reason))
+
+    def active(self, feeder: str) -> int:
+        """Return the number of active alarms at the latest tick of a feeder."""
+        return self._shown[feeder][-1] if feeder in self._shown else 0
 
     def _show(self, feeder: str, gauges: tuple[Gauge, ...], now: tuple[int, ...]) -> None:
         if self._shown.get(feeder) != now:

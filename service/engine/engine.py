@@ -40,9 +40,10 @@ from service.alarms.state_machine import (
 from service.alarms.state_machine import to_json as alarm_json
 from service.engine.commissioning import CommissioningProgress, FeederCommissioning
 from service.engine.feeder_monitor import FeederMonitor, Suspicions, TickResult, align_rules, known_of
+from service.engine.load import FeederLoad, LoadControl
 from service.errors import FeederUnknown
 from service.ingest.align import Clock
-from service.ingest.queues import Sample
+from service.ingest.queues import Inbox, Sample
 from service.ingest.reading import BadReading, BadReason, Reading, Readings, Wire, head_of
 from service.metrics import Metrics
 from service.report.report import FeederReport
@@ -240,6 +241,7 @@ class Engine:
         self._marks: dict[str, Mark] = {}
         self._wakes: dict[str, float] = {}
         self._until = -math.inf
+        self.load = LoadControl(clock)
         for site in sites:
             self.add(site)
 
@@ -262,6 +264,8 @@ class Engine:
         self.committer.waiting.add(transitions=close(twice, self._wall(), TOLD_TWICE))
         self.monitors = {**self.monitors, name: monitor}
         self._wakes[name] = -math.inf
+        settings = site.tables.meta.monitor
+        self.load.feeders[name] = FeederLoad(settings.tick_s, len(site.meter_ids) + 1)
         self.unloaded.pop(name, None)
         self._learn()
         return monitor
@@ -334,6 +338,7 @@ class Engine:
         self.monitors = {other: kept for other, kept in self.monitors.items() if other != name}
         self._wakes.pop(name, None)
         self._marks.pop(name, None)
+        self.load.feeders.pop(name, None)
         self.committer.waiting.forget(name)
         self._learn()
         self.metrics.forget(name)
@@ -363,18 +368,18 @@ class Engine:
 
     # ---------------------------------------------------------------- one round
 
-    def cycle(self, samples: list[Sample], oldest: Callable[[], float | None] = lambda: None) -> bool:
+    def cycle(self, samples: list[Sample], oldest: Callable[[], Mapping[str, float]] = dict) -> bool:
         """Process samples and due ticks, store, publish.
 
-        `oldest` returns the arrival time of the oldest waiting sample, Unix s; None if none waits. Returns
-        True if there is a new report.
+        `oldest` returns the arrival time of the oldest waiting sample of feeders, Unix s. Returns True if
+        there is a new report.
         """
         started = time.perf_counter()
         bad = self._place(samples)
-        now, waiting = self._wall(), oldest()
-        # A tick must not end before samples that arrived in time have left the queue.
-        self._reach(now if waiting is None else min(now, waiting))
+        self._reach(self._wall(), oldest())
+        placed = time.perf_counter()
         results = self._judge()
+        judged = time.perf_counter()
         entries, left_out = some_of_each(bad)
         self.committer.waiting.add(rejected=entries)
         self.metrics.forgotten.labels("bad-reading").inc(left_out)
@@ -387,14 +392,40 @@ class Engine:
             self.keep_states((monitor,))
         self.committer.commit()
         self._publish_estimates(results)
+        ended = time.perf_counter()
         if samples or results:
-            self.metrics.cycle.observe(time.perf_counter() - started)
+            self.metrics.cycle.observe(ended - started)
+        self.load.count_round(ended - started, placed - started, judged - placed, len(samples))
         return bool(results)
 
-    def _reach(self, until: float) -> None:
-        """Add the ticks that are due at a wall time, Unix s, to the pending ones."""
-        back, before, self._until = until < self._until, self._until, until
+    def control(self, inbox: Inbox, dropped: int) -> None:
+        """Under lasting overload, stop monitoring some feeders, and begin again as soon as the load fits.
+
+        `dropped` is the number of samples that the queue has dropped since the last call.
+        """
+        self.load.count_losses(dropped)
+        for name, load in self.load.feeders.items():
+            load.standing = bool(self.metrics.active(name))
+        if not self.load.update(inbox.offered()):
+            return
+        shed = frozenset(self.load.shed)
+        changed = sorted(shed ^ inbox.shed)
+        inbox.shed = shed
+        for name in changed:
+            inbox.forget(name)
+            self.monitors[name].set_shed(name in shed)
+            self._set_wake(self.monitors[name])
+        self.metrics.shed.set(len(shed))
+        _log.warning("feeders are shed because of overload", feeders=len(shed), changed=changed[:SHOWN])
+
+    def _reach(self, now: float, waiting: Mapping[str, float]) -> None:
+        """Add the ticks that are due at the wall time `now`, Unix s, to the pending ones.
+
+        A tick must not end before samples that arrived in time have left the queue: `waiting` as in `cycle`.
+        """
+        back, before, self._until = now < self._until, self._until, now
         for name, monitor in self.monitors.items():
+            until = min(now, waiting.get(name, now))
             if back:
                 # The alignment detects a clock that is set back by the latest time that it has reached.
                 self._guarded(monitor, partial(monitor.reach, before))
@@ -460,9 +491,11 @@ class Engine:
         results: list[TickResult] = []
 
         def judge(monitor: FeederMonitor) -> None:
-            skipped = monitor.skipped
+            skipped, begun = monitor.skipped, time.perf_counter()
             result = self._guarded(monitor, monitor.judge)
+            self.load.count_tick(monitor.name, time.perf_counter() - begun)
             if monitor.skipped > skipped:
+                self.load.count_losses(monitor.skipped - skipped)
                 self.metrics.skipped.labels(monitor.name).inc(monitor.skipped - skipped)
                 self._catch_up.skipped(monitor.name, monitor.skipped - skipped)
             if result is not None:

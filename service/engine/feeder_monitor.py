@@ -97,6 +97,8 @@ class Suspicions:
 POWER_MAX_FACTOR = 100.0
 """Largest plausible power over the feeder's base power."""
 
+OVERLOAD_REASON = "not monitored: the service is overloaded, and discards the readings of this feeder"
+
 PATIENCE_MIN_S = 5.0
 """Lower limit of `patience_s`, s."""
 
@@ -167,6 +169,7 @@ class FeederMonitor:
     latest: result of the latest tick, or None before the first one.
     pending: ticks that are due and not evaluated, oldest first.
     skipped: number of skipped ticks.
+    shed: True while it is not monitored because of overload.
     defect: error that ended the monitor, until it is logged; None without one.
     rules: times of its alignment.
     book: its alarms so far.
@@ -194,6 +197,7 @@ class FeederMonitor:
         self.latest: TickState | None = None
         self.pending: deque[Tick] = deque()
         self.skipped = 0
+        self.shed = False
         self.defect: Exception | None = None
         self._alarm_rules = alarm_rules(site, rules)
         self._data_errors = DataErrors(site)
@@ -268,6 +272,11 @@ class FeederMonitor:
         self.skipped += tick.skipped
         return self._result(tick)
 
+    def set_shed(self, shed: bool) -> None:
+        """Begin or end the time without monitoring; it is no evidence of silence."""
+        self.shed = shed
+        self.aligner.excuse()
+
     def finish(self) -> None:
         """Add all ticks that the time has reached to the pending ones: the input has ended."""
         self.pending.extend(self.aligner.flush())
@@ -317,6 +326,11 @@ class FeederMonitor:
         return replace(state, revision=self.revision, t_measured=measured, since=since)
 
     def _judge(self, tick: Tick) -> TickState:
+        if self.shed:
+            # Its readings are discarded unread: no meter is silent.
+            return TickState(
+                self.site, replace(tick, silent=()), self.max_attacked, Cause.OVERLOAD, OVERLOAD_REASON
+            )
         if self._watcher is None:
             if self.phase is Phase.FAILED:
                 cause, reason = Cause.DESIGN_INVALID, f"not monitored: {self.problem}"

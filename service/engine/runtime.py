@@ -92,7 +92,10 @@ class Runtime:
             lambda: self._in_loop(self._wake.set),
             max_samples=config.max_samples,
             lossless=self._waits,
+            feeder_of=self._feeder_of,
         )
+        self._prefix = f"{config.prefix}/"
+        self._dropped = 0
         self._commands: deque[tuple[Callable[[], Future[Any]], asyncio.Future[Any]]] = deque()
         self._prepared: set[asyncio.Future[tuple[Site, DesignedEstimator]]] = set()
         self._subscribers: set[asyncio.Queue[str]] = set()
@@ -106,6 +109,11 @@ class Runtime:
 
     # ---------------------------------------------------------------- the task
 
+    def _feeder_of(self, key: str) -> str | None:
+        """Monitored feeder of a zenoh key, or None."""
+        name = key.removeprefix(self._prefix).partition("/")[0]
+        return name if name in self._engine.monitors else None
+
     def attach(self, publisher: Publisher) -> None:
         """Set the publisher of estimates and alarms; called before `run`."""
         self._engine.committer.publisher = publisher
@@ -115,6 +123,7 @@ class Runtime:
         dropped = self._inbox.put(batch)
         self._engine.metrics.samples.inc(len(batch))
         self._engine.metrics.dropped.inc(dropped)
+        self._dropped += dropped
         return dropped
 
     async def run(self) -> None:
@@ -130,8 +139,7 @@ class Runtime:
             while not self._stopping:
                 self._check_writer()
                 await self._execute_commands()
-                samples = self._samples()
-                news = await self._in_worker(self._engine.cycle, samples, self._inbox.oldest)
+                news = await self._in_worker(self._round)
                 self._last_round = time.monotonic()
                 self._engine.metrics.queue.set(len(self._inbox))
                 if news:
@@ -148,6 +156,13 @@ class Runtime:
                 answer.cancel()
             self._worker.shutdown(wait=False)
             self._writer.shutdown(wait=False)
+
+    def _round(self) -> bool:
+        news = self._engine.cycle(self._samples(), self._inbox.oldest)
+        if not self._waits:
+            dropped, self._dropped = self._dropped, 0
+            self._engine.control(self._inbox, dropped)
+        return news
 
     def _check_writer(self) -> None:
         if (lost := self.store.lost) is not None:
@@ -395,6 +410,8 @@ class Runtime:
             told, waits = monitor.latest, engine.config.clock is Clock.WALL
             if waits and told is not None and (age := self.age(told)) > monitor.patience_s:
                 problems.append(f"feeder {monitor.name}: the latest report is {age:.0f} s old")
+        if shed := len(self._inbox.shed):
+            problems.append(f"overload: {shed} of {len(engine.monitors)} feeders are not monitored")
         for name, problem in engine.unloaded.copy().items():
             problems.append(f"feeder {name}: {problem}")
         return not problems, problems

@@ -36,7 +36,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid, Problem
-from service.ingest.reading import COLUMNS, NO_SEQ, P_KW, Q_KVAR, T, T_POWER, V_VOLT, Reading, Readings
+from service.ingest.reading import COLUMNS, NO_SEQ, V_VOLT, Reading, Readings, T
 
 KEPT: Final = 64
 """Newest arrivals of a source that its median delay uses."""
@@ -330,9 +330,7 @@ class Aligner:
         self.restarts = 0
         self._skipped = 0
         size = len(self.meters) + 1
-        self._index: dict[str | None, int] = {
-            source: k for k, source in enumerate((*self.meters, None))
-        }
+        self._index: dict[str | None, int] = {source: k for k, source in enumerate((*self.meters, None))}
         self._each = np.arange(size)
         # (5, slots, p + 1): held readings of each source by time; the time of an empty slot is infinite.
         self._held = _empty(SLOTS, size)
@@ -554,7 +552,9 @@ class Aligner:
     def _thin(self, source: int) -> None:
         """Keep only the last reading between two ticks: no tick uses the others."""
         numbers = [self._serves(t) for t in self._times(source)]
-        self._keep(source, [k for k, (one, after) in enumerate(zip_longest(numbers, numbers[1:])) if one != after])
+        self._keep(
+            source, [k for k, (one, after) in enumerate(zip_longest(numbers, numbers[1:])) if one != after]
+        )
 
     def _keep(self, source: int, which: list[int]) -> None:
         """Keep only some held readings of a source, by position."""
@@ -696,6 +696,12 @@ class Aligner:
             tick = self._tick(t)
             self._turn_to(self._number() + 1)
             yield tick
+
+    def excuse(self) -> None:
+        """Count no time until now as silence: the readings were discarded."""
+        if self._next is not None:
+            self._resumed = self._time(self._next)
+            self._turn_to(self._next)
 
     def flush(self) -> Iterator[Tick]:
         """Emit every tick that the time has reached, without grace: the input has ended."""

@@ -1061,9 +1061,7 @@ def _batch(rows: list[Any], of: Payload) -> DecodedPayload:
     return DecodedPayload(readings, bad)
 
 
-def _judged(
-    rows: Iterable[tuple[int, Any]], of: Payload
-) -> tuple[list[WireReading], tuple[BadReading, ...]]:
+def _judged(rows: Iterable[tuple[int, Any]], of: Payload) -> tuple[list[WireReading], tuple[BadReading, ...]]:
     """Return the readings of elements with their positions, and the bad ones with all their problems."""
     raws: list[WireReading] = []
     bad: dict[BadReason, list[BadReading]] = {}

@@ -209,6 +209,8 @@ class Bus:
 
     def _published_by_others(self, key: str) -> bool:
         """True for keys that another service with this prefix publishes."""
+        if key.endswith(("/reading", "/readings")):
+            return False
         match key.removeprefix(f"{self._prefix}/").split("/"):
             case [_, "estimate"] | [_, "alarm", _]:
                 return True

@@ -27,7 +27,8 @@ def tick_of(
     **more: Any,
 ) -> Tick:
     """Return the tick with a usable reading of each meter, or None, and of the busbar meter."""
-    values = np.array([_column(one) for one in (*readings, busbar)]).T
+    # Simulated readings have None where nothing is reported.
+    values = np.array([_column(one) for one in (*readings, busbar)], dtype=np.float64).T
     return Tick(t, values, silent, v_phases=None if busbar is None else busbar.v_phases, **more)
 
 
@@ -43,7 +44,15 @@ def readings_of(tick: Tick, meters: Sequence[str] | None = None) -> tuple[Readin
 def plain(ticks: Sequence[Tick]) -> list[Any]:
     """Return everything in ticks, for comparison."""
     return [
-        (one.t, repr(one.values.tolist()), one.silent, one.skipped, one.clock_offset, one.busbar_offset, one.v_phases)
+        (
+            one.t,
+            repr(one.values.tolist()),
+            one.silent,
+            one.skipped,
+            one.clock_offset,
+            one.busbar_offset,
+            one.v_phases,
+        )
         for one in ticks
     ]
 

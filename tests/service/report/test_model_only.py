@@ -148,11 +148,11 @@ def test_a_sound_verdict_raises_no_voltage_alarm_from_the_model_alone(site: Site
     _, estimate, verdict = estimator.step(state, to_frame(site, snapshot(site, live)))
     sound = replace(verdict, cause=Cause.SILENT_METERS)
     high = replace(estimate, v2=estimate.v2 * 1.3, v2_bus=estimate.v2_bus * 1.3)
-    none = replace(live, readings=(None,) * len(readings), busbar=None)
+    none = replace(live, values=np.full_like(live.values, np.nan))
     alarms = {}
     for tick in (live, none):
         found = conditions(build(site, tick, 2, high, sound))
-        alarms[tick.busbar is None] = {c.known for c in found if c.kind is AlarmKind.VOLTAGE_LIMIT}
+        alarms[not tick.seen.any()] = {c.known for c in found if c.kind is AlarmKind.VOLTAGE_LIMIT}
     assert alarms == {False: {True}, True: {False}}
 
 

@@ -7,7 +7,6 @@ import math
 import re
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -20,7 +19,7 @@ from gridsec.interface import Cause, Decision, Estimate, Explanation, Manipulati
 from service.alarms.conditions import AlarmKind, conditions
 from service.engine.feeder_monitor import design
 from service.ingest.align import Tick
-from service.ingest.reading import Reading
+from service.ingest.reading import P_KW, T_POWER, Reading
 from service.report.report import (
     BUSBAR,
     ExplanationReport,

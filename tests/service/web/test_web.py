@@ -17,7 +17,6 @@ from benchmarks.mesh import baran_wu
 from feeders.model.site import Site as FeederSite
 from feeders.model.site import from_tables, load, names
 from gridsec.interface import Cause, Decision
-from service.ingest.align import Tick
 from service.report.feeder_info import detail
 from service.report.report import BusbarMeterState, BusState, blind
 from tests.feeders import stations
