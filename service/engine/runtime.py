@@ -32,6 +32,7 @@ from service.ingest.align import Clock
 from service.ingest.queues import Inbox, Sample
 from service.report import feeder_info
 from service.report.report import FeederReport
+from service.report.tick_state import TickState
 from service.store import OutcomeUnknown, Store, StoreUnavailable
 from service.store.committer import Publisher, WriteResult
 
@@ -359,7 +360,7 @@ class Runtime:
         monitor = self._engine.monitors.get(name)
         return None if monitor is None else monitor.report
 
-    def age(self, report: FeederReport) -> float:
+    def age(self, report: FeederReport | TickState) -> float:
         """Return the age of a feeder's latest report by the service's clock, s.
 
         With `Clock.EVENTS` the age counts from the creation of the report.

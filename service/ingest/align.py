@@ -85,23 +85,21 @@ class ClockOffsets:
 
     def note_all(self, source: Ints, t: Floats, arrival: Floats) -> None:
         """Add the delays of readings, (n,), grouped by source, those of each in the order of arrival."""
-        begins = np.ones(source.size, dtype=np.bool_)
-        begins[1:] = (source[1:] != source[:-1]) | (arrival[1:] != arrival[:-1])
-        at = np.flatnonzero(begins)
-        delay = np.minimum.reduceat(arrival - t, at)
-        of, arrived = source[at], arrival[at]
+        of, arrived, delay = source, arrival, arrival - t
+        again = source[1:] == source[:-1]
+        if again.any():
+            at = np.flatnonzero(np.concatenate(([True], ~again | (arrival[1:] != arrival[:-1]))))
+            of, arrived, delay = source[at], arrival[at], np.minimum.reduceat(delay, at)
         # The first instant of a source may go on with its newest one.
-        first = np.ones(at.size, dtype=np.bool_)
-        first[1:] = of[1:] != of[:-1]
-        same = first & (self._arrived[of] == arrived)
-        old = of[same]
-        newest = self._newest[old]
-        self._delays[newest, old] = np.minimum(self._delays[newest, old], delay[same])
-        fresh = ~same
-        of, arrived, delay = of[fresh], arrived[fresh], delay[fresh]
+        same = self._arrived[of] == arrived
+        if same.any():
+            same[1:] &= of[1:] != of[:-1]
+            old = of[same]
+            newest = self._newest[old]
+            self._delays[newest, old] = np.minimum(self._delays[newest, old], delay[same])
+            of, arrived, delay = of[~same], arrived[~same], delay[~same]
         if of.size:
-            rank = _rank(of)
-            place = (self._newest[of] + 1 + rank) % KEPT
+            place = (self._newest[of] + 1 + _rank(of)) % KEPT
             self._delays[place, of] = delay
             self._newest[of], self._arrived[of] = place, arrived
             self._count += np.bincount(of, minlength=self._count.size)
@@ -160,9 +158,11 @@ def _medians(columns: Floats, count: Ints) -> Floats:
 
 def _rank(grouped: Ints) -> Ints:
     """Position of each element among the equal ones before it; equal elements are side by side."""
-    begins = np.ones(grouped.size, dtype=np.bool_)
-    begins[1:] = grouped[1:] != grouped[:-1]
+    again = grouped[1:] == grouped[:-1]
+    if not again.any():
+        return np.zeros(grouped.size, dtype=np.intp)
     each = np.arange(grouped.size)
+    begins = np.concatenate(([True], ~again))
     return each - np.maximum.accumulate(np.where(begins, each, 0))
 
 
@@ -432,51 +432,69 @@ class Aligner:
     def _run(self, readings: Readings, latest: Floats, begin: int) -> int:
         """Place the run of readings from `begin` that are in order and before the next tick; return its end.
 
+        In a run each reading of a source is later than the one before it, or repeats it.
+
         latest (n,): newest arrival up to each reading, Unix s. Nothing is placed if the run is shorter than
         `ALONE`.
         """
         rules, number = self.rules, self._number()
-        source, t, arrival = readings.source[begin:], readings.values[T, begin:], readings.arrival[begin:]
         latest = latest[begin:]
         # From the end of the grace, and from where the backlog ends, a tick may come before a reading.
         limit = min(self._time(number) + rules.grace_s, self._time(number + rules.backlog))
-        end = max(1, int(np.searchsorted(latest, limit)))
-        order = np.argsort(source[:end], kind="stable")
+        end = max(1, int(latest.searchsorted(limit)))
+        source, arrival = readings.source[begin : begin + end], readings.arrival[begin : begin + end]
+        t = readings.values[T, begin : begin + end]
+        order = source.argsort(kind="stable")
         by_source, by_t = source[order], t[order]
-        rank = _rank(by_source)
-        before = np.where(rank > 0, np.concatenate(([0.0], by_t[:-1])), self._last_t[by_source])
-        plain = np.empty(end, dtype=np.bool_)
-        plain[order] = (by_t > before) & (self._count[by_source] + rank < HELD_PER_SOURCE)
-        plain &= np.abs(t[:end] - arrival[:end]) <= rules.max_skew_s
-        plain &= t[:end] > self._time(number - 1) + rules.lead_s
+        repeated = by_source[1:] == by_source[:-1]
+        before, room = self._last_t[by_source], HELD_PER_SOURCE - self._count[by_source]
+        if repeated.any():
+            before[1:][repeated] = by_t[:-1][repeated]
+            room -= _rank(by_source)
+        plain, fresh = np.empty((2, end), dtype=np.bool_)
+        fresh[order] = by_t > before
+        plain[order] = (by_t >= before) & (room > 0)
+        late = t <= self._time(number - 1) + rules.lead_s
+        plain &= np.abs(t - arrival) <= rules.max_skew_s
+        if late.any():
+            # A late reading of a source that is not waited for may be the end of its silence. An old one of a
+            # source without any other may show its silence.
+            silent = self._time(number) - np.minimum(t, arrival) > rules.silence_s
+            plain &= ~(late & fresh & (silent | ~self._waiting[source]))
         if not plain.all():
             end = int(plain.argmin())
         # The tick comes with the reading of the last source that it waits for, once its time is reached.
-        reached = int(np.searchsorted(latest[:end], self._time(number)))
+        reached = int(latest[:end].searchsorted(self._time(number)))
         if reached < end:
-            last = self._last_waiting(source[:end])
+            last = self._last_waiting(source[:end], fresh[:end] & ~late[:end])
             end = min(end, max(last + 1, reached))
         if end < ALONE:
             return begin
-        self._place_run(readings, begin, order[order < end])
+        chosen = order[(order < end) & fresh[order]]
+        self.counts[ReadingOutcome.DUPLICATE] += end - chosen.size
+        if chosen.size:
+            self._place_run(readings, begin + chosen, late[chosen])
         return begin + end
 
-    def _last_waiting(self, source: Ints) -> int:
-        """Position of the reading after which no source is waited for; the size if some still are."""
+    def _last_waiting(self, source: Ints, reports: Bools) -> int:
+        """Position of the reading after which no source is waited for; the size if some still are.
+
+        reports (n,): readings that count for the next tick.
+        """
         if not self._waits:
             return -1
         first = np.full(self._waiting.size, source.size)
-        np.minimum.at(first, source, np.arange(source.size))
+        at = np.flatnonzero(reports)[::-1]
+        # Of equal indices the last assignment counts.
+        first[source[at]] = at
         return int(first[self._waiting].max())
 
-    def _place_run(self, readings: Readings, begin: int, order: Ints) -> None:
-        """Place readings of a run; `order` are their positions after `begin`, grouped by source."""
-        at = begin + order
+    def _place_run(self, readings: Readings, at: Ints, late: Bools) -> None:
+        """Place readings of a run, grouped by source; `late` are those that the last tick has missed."""
         source, arrival, values = readings.source[at], readings.arrival[at], readings.values[:, at]
-        rank = _rank(source)
+        slot = self._count[source] + _rank(source)
         self._clocks.note_all(source, values[T], arrival)
         self._count_gaps(source, readings.seq[at])
-        slot = self._count[source] + rank
         if (most := int(slot.max())) >= self._held.shape[1]:
             self._grow(most + 1)
         self._held[:, slot, source] = values
@@ -487,10 +505,11 @@ class Aligner:
         if readings.v_phases is not None:
             for k in np.flatnonzero(source == len(self.meters)):
                 self._keep_phases(float(values[T, k]), readings.phases_of(int(at[k])))
-        # All of them are later than the last tick.
-        self._waiting[source] = False
+        missed = int(np.count_nonzero(late))
+        self.counts[ReadingOutcome.LATE] += missed
+        self.counts[ReadingOutcome.ACCEPTED] += source.size - missed
+        self._waiting[source[~late] if missed else source] = False
         self._waits = int(np.count_nonzero(self._waiting))
-        self.counts[ReadingOutcome.ACCEPTED] += int(order.size)
 
     def _keep_phases(self, t: float, phases: tuple[float, ...] | None) -> None:
         if phases is not None:

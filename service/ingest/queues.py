@@ -236,6 +236,10 @@ RETRY_S = 1.0
 """Time until the next attempt to publish a refused event, s."""
 
 
+Value = bytes | Callable[[], bytes]
+"""JSON, or a function that builds it; the function is called only if something receives the value."""
+
+
 class Publication(NamedTuple):
     """A put, or (without a payload) a deletion, that must not be lost; `done` is called after it."""
 
@@ -252,12 +256,12 @@ class Outgoing:
 
     def __init__(self) -> None:
         self.retry_at: float | None = None
-        self._telemetry: deque[tuple[str, Callable[[], bytes]]] = deque(maxlen=TELEMETRY_WAITING)
+        self._telemetry: deque[tuple[str, Value]] = deque(maxlen=TELEMETRY_WAITING)
         self._events: deque[Publication] = deque()
         self._closing = False
         self._wakeup = threading.Condition()
 
-    def add_telemetry(self, key: str, payload: Callable[[], bytes]) -> None:
+    def add_telemetry(self, key: str, payload: Value) -> None:
         """Add a value; a full queue drops the oldest."""
         with self._wakeup:
             self._telemetry.append((key, payload))
@@ -278,7 +282,7 @@ class Outgoing:
             self._closing = True
             self._wakeup.notify()
 
-    def next(self) -> Publication | tuple[str, Callable[[], bytes]] | None:
+    def next(self) -> Publication | tuple[str, Value] | None:
         """Wait for the next item and remove it; events come first. None after the last one."""
         with self._wakeup:
             while True:

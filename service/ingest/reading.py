@@ -163,6 +163,10 @@ class BadReading:
     count: int = 1
 
 
+ORDERS_KEPT = 32
+"""Columns of meters of one feeder whose positions are kept."""
+
+
 @dataclass(frozen=True, slots=True)
 class Known:
     """Properties of a feeder that the validation of its readings uses."""
@@ -176,6 +180,8 @@ class Known:
     index: Mapping[str | None, int] = field(init=False)  # position of each meter; the busbar meter is last
     volt_max: Floats = field(init=False, compare=False)  # largest plausible voltage of each source, V
     ids: pa.Array = field(init=False, compare=False)  # the meters as a column
+    # Results of `sources_of`, by contents.
+    orders: dict[tuple[Any, ...], Ints] = field(init=False, compare=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         order = tuple(self.meters)
@@ -184,6 +190,22 @@ class Known:
         highest = np.array([VOLT_FACTOR * self.volt(source) for source in (*order, None)])
         object.__setattr__(self, "volt_max", highest)
         object.__setattr__(self, "ids", pa.array(order, pa.string()))
+
+    def sources_of(self, names: pa.Array) -> Ints:
+        """Return the position of each meter of a column, (n,); -1 for other names and nulls.
+
+        The column of a concentrator is mostly the same: the newest results are kept by the column's contents.
+        """
+        buffers = [b"" if one is None else one.to_pybytes() for one in names.buffers()]
+        key = (str(names.type), len(names), names.offset, *buffers)
+        found = self.orders.get(key)
+        if found is None:
+            place = pc.index_in(names, value_set=self.ids.cast(names.type))
+            found = pc.fill_null(place, -1).to_numpy(zero_copy_only=False).astype(np.intp)
+            if len(self.orders) >= ORDERS_KEPT:
+                self.orders.clear()
+            self.orders[key] = found
+        return found
 
     def volt(self, meter: object) -> float:
         """Return the nominal voltage of a meter, or of the busbar for anything else, V."""
@@ -1024,9 +1046,7 @@ def _of_batch(batch: pa.RecordBatch, present: Collection[str], of: Payload) -> t
         fits = (counts >= 0) & (counts <= SEQ_MAX)
         good &= fits
         seq[valid & fits] = counts[valid & fits]
-    names = batch.column("meter")
-    found = pc.index_in(names, value_set=of.known.ids.cast(names.type))
-    source = pc.fill_null(found, -1).to_numpy(zero_copy_only=False).astype(np.intp)
+    source = of.known.sources_of(batch.column("meter"))
     good &= plausible(of.known, source, values, seq)
     return of.columns(source, values, seq), good
 

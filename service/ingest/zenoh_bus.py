@@ -15,10 +15,11 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
+import structlog
 import zenoh
 
 from service.access.signing import ATTACHMENT_MAX
-from service.ingest.queues import BusConfig, BusCounts, BusUnavailable, Outgoing, Publication, Sample
+from service.ingest.queues import BusConfig, BusCounts, BusUnavailable, Outgoing, Publication, Sample, Value
 
 RING = 8192
 """Capacity of the subscription's queue, samples."""
@@ -29,6 +30,7 @@ QUERIES_WAITING = 256
 _ESTIMATES = 1024
 _OPEN_TIMEOUT_MS = 5_000
 JSON = "application/json"
+_log = structlog.get_logger("gridsec.zenoh")
 _MULTICAST = "udp/224.0.0.224:7446"
 """Group of zenoh's multicast scouting."""
 
@@ -145,7 +147,7 @@ class Bus:
         self._stack = ExitStack()
         self._threads: list[threading.Thread] = []
         self._outgoing = Outgoing()
-        self._answers: dict[str, bytes | Callable[[], bytes]] = {}
+        self._answers: dict[str, Value] = {}
         self._answers_lock = threading.Lock()
         self.counts = BusCounts()
         self.failure: str | None = None
@@ -228,11 +230,10 @@ class Bus:
 
     # ---------------------------------------------------------------- out
 
-    def telemetry(self, key: str, payload: Callable[[], bytes]) -> None:
+    def telemetry(self, key: str, payload: Value) -> None:
         """Publish the newest value of a key, and store it for queries.
 
-        `key` has no prefix. `payload` returns JSON; it is called in another thread, for a subscriber or a
-        query.
+        `key` has no prefix. A function is called in another thread, for a subscriber or a query.
         """
         with self._answers_lock:
             self._answers[f"{self._prefix}/{key}"] = payload
@@ -281,9 +282,12 @@ class Bus:
                             encoding=JSON,
                             congestion_control=zenoh.CongestionControl.DROP,
                         )
-                    if not publishers[key].matching_status.matching:
+                    if not isinstance(value, bytes) and not publishers[key].matching_status:
                         continue
-                    publishers[key].put(value())
+                    text = _text(key, value)
+                    if text is None:
+                        continue
+                    publishers[key].put(text)
             except zenoh.ZError as error:
                 self.counts.publish_failed += 1
                 self.failure = _first_line(error)
@@ -315,10 +319,21 @@ class Bus:
                 known = tuple(self._answers.items())
             with query:
                 for key, payload in known:
-                    if query.key_expr.intersects(key):
-                        text = payload if isinstance(payload, bytes) else payload()
-                        if not _reply(query, key, text):
-                            break
+                    if not query.key_expr.intersects(key) or (text := _text(key, payload)) is None:
+                        continue
+                    if not _reply(query, key, text):
+                        break
+
+
+def _text(key: str, value: Value) -> bytes | None:
+    """Payload of a value; None, with a line in the log, if it cannot be built."""
+    if isinstance(value, bytes):
+        return value
+    try:
+        return value()
+    except Exception:  # noqa: BLE001 - the other values are published
+        _log.exception("a value could not be built", key=key)
+        return None
 
 
 def _well_formed(key: str) -> bool:

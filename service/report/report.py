@@ -768,21 +768,24 @@ def meter_states(
     ratio = (site.customer_volt / nominal) ** 2
     v2 = unknown if estimate is None else (estimate.v2 * ratio)[at]
     offsets = tick.clock_offset or (None,) * site.meters.size
+    reported = tick.values[V_VOLT, :-1][chosen]
     columns = zip(
         chosen.tolist(),
         at.tolist(),
         tick.seen[chosen].tolist(),
         suspects.tolist(),
-        *map(_numbers, (score, threshold, tick.values[V_VOLT, :-1][chosen], v, std, v2, attack)),
         nominal[at].tolist(),
         model_only[at].tolist(),
+        zip(*map(_numbers, (score, threshold, reported, v, std, v2, attack)), strict=True),
         strict=True,
     )
     return tuple(
         MeterState(
             site.meter_ids[k],
             (row := site.tables.customers[customer]).bus,
-            *state,
+            seen,
+            suspect,
+            *numbers,
             kind=None if not kinds or kinds[k] is None else str(kinds[k]),
             phase=row.phases if len(row.phases) == 1 else None,
             v_min_volt=limits.v_min_pu * volt,
@@ -790,7 +793,7 @@ def meter_states(
             model_only=alone,
             clock_offset_s=offsets[k],
         )
-        for k, customer, *state, volt, alone in columns
+        for k, customer, seen, suspect, volt, alone, numbers in columns
     )
 
 

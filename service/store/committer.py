@@ -29,7 +29,7 @@ import structlog
 
 from service.alarms.state_machine import Alarm, AlarmTransition, Change, carried
 from service.alarms.state_machine import to_json as alarm_json
-from service.ingest.queues import BusCounts
+from service.ingest.queues import BusCounts, Value
 from service.metrics import Metrics
 from service.report.report import FeederReport
 from service.store import AlarmEvent, OutcomeUnknown, Rejected, Store, StoreUnavailable
@@ -209,8 +209,8 @@ class Publisher(Protocol):
     failure: str | None
     counts: BusCounts
 
-    def telemetry(self, key: str, payload: Callable[[], bytes]) -> None:
-        """Publish the newest value of a key; `payload` is called only if something receives it."""
+    def telemetry(self, key: str, payload: Value) -> None:
+        """Publish the newest value of a key."""
 
     def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
         """Publish an event that must not be lost; False if the queue is full."""
