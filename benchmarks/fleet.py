@@ -1,4 +1,4 @@
-"""Cost of many feeders in one process: time by stage, rates of decoding, and meters held at one reading a second.
+"""Cost of many feeders in one process: time by stage, rates of decoding, meters held at one reading a second.
 
     python -m benchmarks.fleet [SECONDS] [MOST] [--costs]
 
@@ -6,7 +6,7 @@ Feeders are copies of the Kerber suburban network, 146 meters and the busbar eac
 
 1. Stages: an engine without zenoh takes calm ticks of four feeders, as single JSON readings and as batches in
    Arrow, CBOR and JSON. Processor time of each stage, as a multiple of the estimator's step.
-2. Rates: single messages per second of a raw zenoh subscriber in Python, and of a subscriber with decoding and
+2. Rates: single messages per second of a raw zenoh subscriber in Python, and of one with decoding and
    alignment; readings per second of decoding and alignment of batches.
 3. Fleet: the service is a process of its own, this one publishes each meter once a second for SECONDS. The
    number of feeders grows by half from 8 until a tick is late, a payload is lost or a feeder is left out, or
@@ -42,7 +42,7 @@ from feeders.simulation.scenario import Scenario, SimulatedReading, simulate
 from service.cli.simulate import key_of
 from service.engine import feeder_monitor
 from service.engine.engine import Engine, RuntimeConfig
-from service.engine.feeder_monitor import FeederMonitor, design, known_of
+from service.engine.feeder_monitor import design, known_of
 from service.ingest.align import Aligner, rules
 from service.ingest.queues import BusConfig, BusCounts, Sample, Value
 from service.ingest.reading import Wire
@@ -85,6 +85,7 @@ class Nowhere:
 
     def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
         """Confirm at once."""
+        self.counts.published += bool(key and payload is not None) + last
         if done is not None:
             done()
         return True
@@ -113,7 +114,9 @@ def batch(readings: Sequence[SimulatedReading], t: Sequence[float], form: str) -
     if form == "cbor":
         return cbor2.dumps(columns)
     if form == "json-batch":
-        return json.dumps([dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]).encode()
+        return json.dumps(
+            [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        ).encode()
     table = pa.record_batch(columns)
     sink = pa.BufferOutputStream()
     with ipc.new_stream(sink, table.schema) as writer:
@@ -186,7 +189,11 @@ def stages(site: Site, form: str) -> dict[str, float]:
     names = [f"f{k}" for k in range(COPIES)]
     seconds = list(simulate(site, Scenario(seed=1, duration_s=float(WARM + TICKS), dt_s=1.0)))
     now = seconds[0].t
-    with tempfile.TemporaryDirectory() as folder, Store(f"sqlite:///{folder}/f.db") as store, timed() as spent:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Store(f"sqlite:///{folder}/f.db") as store,
+        timed() as spent,
+    ):
         engine = Engine(RuntimeConfig(), store, copies(site, names), wall=lambda: now, stored=lambda: None)
         engine.committer.publisher = Nowhere()
         for monitor in engine.monitors.values():
@@ -210,7 +217,9 @@ def print_stages(site: Site) -> float:
         print(f"{name:12}" + "".join(f"{one[name] / one['step']:12.3f}" for one in found.values()))
     for form, one in found.items():
         each = 1e6 * one["cycle"] / (len(site.meter_ids) + 1)
-        print(f"{form}: {each:.1f} us per reading, the step {1e6 * one['step'] / (len(site.meter_ids) + 1):.1f} us")
+        print(
+            f"{form}: {each:.1f} us per reading, the step {1e6 * one['step'] / (len(site.meter_ids) + 1):.1f} us"
+        )
     return max(one["cycle"] / one["step"] for one in found.values())
 
 
@@ -330,7 +339,9 @@ def print_rates(site: Site) -> tuple[float, float]:
         for scans in (1, 7):
             found = batch_rate(site, form, scans)
             best = max(best, found)
-            print(f"batches of {scans * len(site.meter_ids)} in {form}: {found / 1e6:.2f} M readings per processor second")
+            print(
+                f"batches of {scans * len(site.meter_ids)} in {form}: {found / 1e6:.2f} M readings per processor second"
+            )
     return used / raw, best
 
 
@@ -390,7 +401,9 @@ def holds(site: Site, folder: Path, number: int, form: str, seconds: float) -> t
     shed = after["gridsec_feeders_shed"]
     held = clean > 0.98 and lost == 0 and delay < LATE_S and shed == 0
     text = f"{form} {number} feeders, {number * 147} sources: {clean:.3f} of the ticks clean, {lost:.0f} lost"
-    text += f", {shed:.0f} left out, mean delay {delay:.2f} s, sender behind by {max(0.0, fleet.behind_s):.2f} s"
+    text += (
+        f", {shed:.0f} left out, mean delay {delay:.2f} s, sender behind by {max(0.0, fleet.behind_s):.2f} s"
+    )
     return held, text
 
 

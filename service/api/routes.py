@@ -63,6 +63,9 @@ class Backend(Protocol):
     def report(self, name: str) -> FeederReport | None:
         """Return the latest report of a feeder, or None before its first tick."""
 
+    def summary(self, name: str) -> dict[str, Any]:
+        """Return the numbers of a feeder's latest tick in the list of feeders; empty before its first tick."""
+
     def age(self, report: FeederReport) -> float:
         """Return the age of a feeder's latest report by the service's clock, s."""
 
@@ -399,20 +402,8 @@ _feeders = APIRouter(prefix="/api/v1/feeders", tags=["feeders"], dependencies=[D
 
 
 def _summary(backend: Backend, fields: dict[str, Any], raised: int) -> models.FeederSummary:
-    report = backend.report(fields["name"])
-    now: dict[str, Any] = {"raised": raised}
-    if report is not None:
-        now |= {
-            "t": report.t,
-            "verdict": report.verdict,
-            "age_s": backend.age(report),
-            "model_only": report.model_only,
-            "since": report.since,
-            "meters": len(report.meters),
-            "suspects": len(report.suspects) + sum(inverter.suspect for inverter in report.inverters),
-            "silent": sum(one.meter != BUSBAR for one in report.silent),
-        }
-    return models.FeederSummary.model_validate({**fields, **now})
+    now = backend.summary(fields["name"])
+    return models.FeederSummary.model_validate({**fields, "raised": raised, **now})
 
 
 def _detail(backend: Backend, feeder: str) -> dict[str, Any]:

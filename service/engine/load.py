@@ -59,7 +59,7 @@ class Window:
     signs: int = 0  # lost samples, skipped ticks and long rounds
 
 
-@dataclass(slots=True)
+@dataclass
 class LoadControl:
     """Selection of the feeders that are not monitored.
 

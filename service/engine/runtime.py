@@ -360,6 +360,12 @@ class Runtime:
         monitor = self._engine.monitors.get(name)
         return None if monitor is None else monitor.report
 
+    def summary(self, name: str) -> dict[str, Any]:
+        """Return the numbers of a feeder's latest tick in the list of feeders; empty before its first tick."""
+        monitor = self._engine.monitors.get(name)
+        latest = None if monitor is None else monitor.latest
+        return {} if latest is None else {**latest.summary(), "age_s": self.age(latest)}
+
     def age(self, report: FeederReport | TickState) -> float:
         """Return the age of a feeder's latest report by the service's clock, s.
 

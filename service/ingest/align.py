@@ -371,7 +371,7 @@ class Aligner:
         """Align readings as `take` does one after the other."""
         size, begin = len(readings), 0
         ticks: list[Tick] = []
-        before, clock_off = self.counts.copy(), list[int]()
+        before, refused, clock_off = self.counts.copy(), len(self._refused), list[int]()
         latest = np.maximum(np.maximum.accumulate(readings.arrival), self._latest)
         while begin < size:
             end = begin
@@ -390,11 +390,10 @@ class Aligner:
                 if outcome is ReadingOutcome.CLOCK_OFF:
                     clock_off.append(k)
             begin = min(begin + ALONE, size)
-        return Placed(self._counted(before), tuple(clock_off), ticks)
+        return Placed(self._counted(before, len(self._refused) - refused), tuple(clock_off), ticks)
 
-    def _counted(self, before: Counter[ReadingOutcome]) -> dict[ReadingOutcome, int]:
-        """Readings by outcome since `before`, each as at its arrival."""
-        refused = len(self._refused)
+    def _counted(self, before: Counter[ReadingOutcome], refused: int) -> dict[ReadingOutcome, int]:
+        """Readings by outcome since `before`, each as at its arrival; `refused` were accepted then."""
         corrected = {ReadingOutcome.ACCEPTED: refused, ReadingOutcome.CLOCK_OFF: -refused}
         counts = {one: self.counts[one] - before[one] + corrected.get(one, 0) for one in ReadingOutcome}
         return {outcome: count for outcome, count in counts.items() if count}

@@ -282,7 +282,7 @@ class Bus:
                             encoding=JSON,
                             congestion_control=zenoh.CongestionControl.DROP,
                         )
-                    if not isinstance(value, bytes) and not publishers[key].matching_status:
+                    if not isinstance(value, bytes) and not _has_receiver(publishers[key]):
                         continue
                     text = _text(key, value)
                     if text is None:
@@ -323,6 +323,12 @@ class Bus:
                         continue
                     if not _reply(query, key, text):
                         break
+
+
+def _has_receiver(publisher: zenoh.Publisher) -> bool:
+    """True if a subscriber matches. The binding's stubs state a boolean in place of the object."""
+    status = publisher.matching_status
+    return bool(getattr(status, "matching", status))
 
 
 def _text(key: str, value: Value) -> bytes | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -95,6 +96,18 @@ class TickState:
     def model_only(self) -> bool:
         """True if no value uses a voltage reading of this tick."""
         return not self.grounds.measured.any()
+
+    def summary(self) -> dict[str, Any]:
+        """Return the numbers of the list of feeders."""
+        return {
+            "t": self.t,
+            "verdict": self.verdict,
+            "model_only": self.model_only,
+            "since": self.since,
+            "meters": len(self.site.meter_ids),
+            "suspects": len(self.suspects) + self.inverters,
+            "silent": sum(meter is not None for meter, _ in self.tick.silent),
+        }
 
     @cached_property
     def grounds(self) -> ReferenceVoltages:

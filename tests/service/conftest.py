@@ -34,7 +34,7 @@ from service.api.routes import create_api
 from service.engine.commissioning import CommissioningProgress
 from service.errors import FeederFixed, FeederUnknown, TooManyFeeders
 from service.report.feeder_info import revision
-from service.report.report import BusState, FeederReport, MeterState, Silence
+from service.report.report import BUSBAR, BusState, FeederReport, MeterState, Silence
 from service.store import Store
 from service.store.schema import CommissioningChange, CommissioningEvent
 from tests.service.asking import T0, Setup
@@ -197,6 +197,21 @@ class SmallService:
 
     def unloaded(self, name: str) -> str | None:
         return self.cannot_load.get(name)
+
+    def summary(self, name: str) -> dict[str, Any]:
+        report = self.report(name)
+        if report is None:
+            return {}
+        return {
+            "t": report.t,
+            "verdict": report.verdict,
+            "age_s": self.age(report),
+            "model_only": report.model_only,
+            "since": report.since,
+            "meters": len(report.meters),
+            "suspects": len(report.suspects) + sum(inverter.suspect for inverter in report.inverters),
+            "silent": sum(one.meter != BUSBAR for one in report.silent),
+        }
 
     def report(self, name: str) -> FeederReport | None:
         return self.reports.get(name)
