@@ -216,10 +216,8 @@ def print_stages(site: Site) -> float:
     for name in STAGES:
         print(f"{name:12}" + "".join(f"{one[name] / one['step']:12.3f}" for one in found.values()))
     for form, one in found.items():
-        each = 1e6 * one["cycle"] / (len(site.meter_ids) + 1)
-        print(
-            f"{form}: {each:.1f} us per reading, the step {1e6 * one['step'] / (len(site.meter_ids) + 1):.1f} us"
-        )
+        each, step = (1e6 * one[name] / (len(site.meter_ids) + 1) for name in ("cycle", "step"))
+        print(f"{form}: {each:.1f} us per reading, the step {step:.1f} us")
     return max(one["cycle"] / one["step"] for one in found.values())
 
 
@@ -248,7 +246,7 @@ def batch_rate(site: Site, form: str, scans: int) -> float:
 
 
 def zenoh_rates(site: Site) -> tuple[float, float]:
-    """Messages per second of a raw subscriber, and of the bus with decoding and alignment; one client sends."""
+    """Messages per second of a raw subscriber, and of the bus with decoding and alignment."""
     wire, aligner = Wire({site.feeder.name: known_of(site)}), Aligner(site.meter_ids, rules(1.0, 1e6))
     seconds = list(simulate(site, Scenario(seed=1, duration_s=2.0, dt_s=1.0)))
     sent = puts(site.feeder.name, seconds[0].readings, seconds[0].t, "json")
@@ -339,9 +337,8 @@ def print_rates(site: Site) -> tuple[float, float]:
         for scans in (1, 7):
             found = batch_rate(site, form, scans)
             best = max(best, found)
-            print(
-                f"batches of {scans * len(site.meter_ids)} in {form}: {found / 1e6:.2f} M readings per processor second"
-            )
+            size = scans * len(site.meter_ids)
+            print(f"batches of {size} in {form}: {found / 1e6:.2f} M readings per processor second")
     return used / raw, best
 
 

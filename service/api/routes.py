@@ -64,7 +64,7 @@ class Backend(Protocol):
         """Return the latest report of a feeder, or None before its first tick."""
 
     def summary(self, name: str) -> dict[str, Any]:
-        """Return the numbers of a feeder's latest tick in the list of feeders; empty before its first tick."""
+        """Return the numbers of a feeder in the list of feeders; empty before its first tick."""
 
     def age(self, report: FeederReport) -> float:
         """Return the age of a feeder's latest report by the service's clock, s."""

@@ -444,13 +444,13 @@ class Engine:
         return min(self._wakes.values(), default=math.inf)
 
     def _history(self, state: TickState) -> tuple[FeederReport, ...]:
-        """The report if the history keeps it: the store selects by the same rule."""
+        """The part of the report that the history keeps, if any: the store selects by the same rule."""
         now = mark(state)
         if not worth_keeping(self._marks.get(state.feeder), now, self.store.history_rules):
             self._count_delay(state.feeder, state.t)
             return ()
         self._marks[state.feeder] = now
-        return (state.report,)
+        return (state.kept(),)
 
     @property
     def behind(self) -> bool:

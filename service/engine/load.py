@@ -4,8 +4,8 @@ The demand of a feeder is ``factor (c_s n + c_t / tick_s)``, in seconds of a rou
 offered per second, c_s the time of a sample, c_t that of a tick, and the factor that of everything else in a
 round. Samples of a feeder that is not monitored are counted, so that its demand stays known.
 
-Under lasting overload whole feeders are left out until the demand of the others is `KEPT`. They return as soon
-as the demand of all fits again.
+Under lasting overload whole feeders are left out until the demand of the others is `KEPT`. They return as
+soon as the demand of all fits again.
 """
 
 from __future__ import annotations

@@ -361,7 +361,7 @@ class Runtime:
         return None if monitor is None else monitor.report
 
     def summary(self, name: str) -> dict[str, Any]:
-        """Return the numbers of a feeder's latest tick in the list of feeders; empty before its first tick."""
+        """Return the numbers of a feeder in the list of feeders; empty before its first tick."""
         monitor = self._engine.monitors.get(name)
         latest = None if monitor is None else monitor.latest
         return {} if latest is None else {**latest.summary(), "age_s": self.age(latest)}

@@ -274,8 +274,8 @@ class Tick:
     """Readings that belong to one tick. p meters."""
 
     t: float  # Unix time, s
-    # (5, p + 1): rows as in `Readings.values`: usable reading of each meter, and last of the busbar meter; NaN
-    # if unavailable.
+    # (5, p + 1): rows as in `Readings.values`: usable reading of each meter, and last of the busbar meter;
+    # NaN if unavailable.
     values: Floats
     # Silent sources as (meter, seconds since the last usable reading); None is the busbar meter, infinity a
     # source without any usable reading.

@@ -77,6 +77,8 @@ class ReferenceVoltages:
 
     def model_only(self, site: Site) -> Bools:
         """Return the customers with model-only values, (N,)."""
+        if site.feeder.busbar_phases == 1:
+            return np.full(len(site.feeder.customers), not self.measured[0])
         return np.asarray(~(site.feeder.busbar_incidence() * self.measured).any(axis=1), dtype=np.bool_)
 
 
@@ -91,6 +93,8 @@ def grounds(
     if verdict is not None:
         busbar = busbar & (verdict.cause is not Cause.NO_BUSBAR)
         busbar = busbar & ~verdict.busbar if verdict.busbar.size else busbar
+    if site.feeder.busbar_phases == 1:
+        return ReferenceVoltages(np.array([used.any()]), busbar)
     of_meters = site.feeder.busbar_incidence()[site.meters[used]].any(axis=0)
     return ReferenceVoltages(np.asarray(of_meters, dtype=np.bool_), busbar)
 
@@ -785,7 +789,13 @@ def meter_states(
             (row := site.tables.customers[customer]).bus,
             seen,
             suspect,
-            *numbers,
+            numbers[0],
+            numbers[1],
+            numbers[2],
+            numbers[3],
+            numbers[4],
+            numbers[5],
+            numbers[6],
             kind=None if not kinds or kinds[k] is None else str(kinds[k]),
             phase=row.phases if len(row.phases) == 1 else None,
             v_min_volt=limits.v_min_pu * volt,

@@ -133,8 +133,8 @@ class TickState:
         """Return the part of the report that conditions depend on; None if none can be present.
 
         An unknown condition has an effect only if an alarm, or a pending one, has its subject. `subjects` are
-        these: meters, customers of inverters and `BUSBAR`; None for the feeder. All other meters and inverters
-        without a condition, the buses and the customers are left out.
+        these: meters, customers of inverters and `BUSBAR`; None for the feeder. All other meters and
+        inverters without a condition, the buses and the customers are left out.
         """
         learning, tick, judgement = self.learning, self.tick, self.judgement
         if learning is not None and learning.stalled:
@@ -146,34 +146,47 @@ class TickState:
         nothing = not (meters.any() or inverters.any() or tick.silent or busbar)
         if nothing and decided and learning is not None:
             return None
-        site, (v, std), alone = self.site, self._volts, self.grounds.model_only(self.site)
+        report = replace(
+            self._part(meters),
+            reason="" if decided else self._reason(),
+            inverters=inverter_states(
+                self.site, self.estimate, judgement, self.grounds.model_only(self.site), inverters
+            ),
+            explanations=() if judgement is None else explanations(self.site, judgement),
+            learning=learning,
+        )
+        return with_data_error(report, self.data_error)
+
+    def kept(self) -> FeederReport:
+        """Return the part of the report that the history keeps: the meters and the busbar meter."""
+        return self._part(None)
+
+    def _part(self, which: Bools | None) -> FeederReport:
+        """Report of the feeder with its busbar meter and some meters, (p,), or all."""
+        site, tick = self.site, self.tick
         limits, nominal = site.tables.meta.limits, site.tables.meta.voltage_volt
-        report = FeederReport(
+        return FeederReport(
             feeder=self.feeder,
             t=self.t,
             verdict=self.verdict,
-            reason="" if decided else self._reason(),
+            reason="",
             cause=self.cause,
             max_attacked=self.max_attacked,
             meters=meter_states(
                 site,
                 tick,
                 self.estimate,
-                judgement,
-                volts_of=(v, std),
-                model_only=alone,
-                which=meters,
+                self.judgement,
+                volts_of=self._volts,
+                model_only=self.grounds.model_only(site),
+                which=which,
             ),
             buses=(),
             silent=tuple(Silence(BUSBAR if meter is None else meter, finite(s)) for meter, s in tick.silent),
             v_min_volt=limits.v_min_pu * nominal,
             v_max_volt=limits.v_max_pu * nominal,
-            inverters=inverter_states(site, self.estimate, judgement, alone, inverters),
-            explanations=() if judgement is None else explanations(site, judgement),
-            busbar=busbar_report(site, tick, self.estimate, judgement),
-            learning=learning,
+            busbar=busbar_report(site, tick, self.estimate, self.judgement),
         )
-        return with_data_error(report, self.data_error)
 
     def _reason(self) -> str:
         """Reason of the verdict, with skipped ticks."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,6 @@ from service.engine.load import HOLD_MAX_S, KEPT, FeederLoad, LoadControl
 from service.ingest.queues import LANE_SAMPLES, Inbox, Sample
 from service.store import Store
 from tests.service.liars import FEEDER, START
-from tests.service.running import Outlet
 
 
 class Machine:
@@ -88,7 +88,7 @@ def test_returns_become_rarer_while_the_estimate_of_the_load_is_wrong() -> None:
         machine.second(100.0 if before else 400.0)
         if before and not machine.shed:
             times.append(machine.t)
-    gaps = [after - one for one, after in zip(times, times[1:], strict=False)]
+    gaps = [after - one for one, after in pairwise(times)]
     assert gaps == sorted(gaps)
     assert HOLD_MAX_S <= gaps[-1] <= HOLD_MAX_S + 4.0
 
