@@ -4,7 +4,7 @@ The demand of a feeder is ``factor (c_s n + c_t / tick_s)``, in seconds of a rou
 offered per second, c_s the time of a sample, c_t that of a tick, and the factor that of everything else in a
 round. Samples of a feeder that is not monitored are counted, so that its demand stays known.
 
-Under lasting overload whole feeders are left out until the demand of the others is `KEPT`. They return as
+Under lasting overload whole feeders are shed until the demand of the others is `KEPT`. They return as
 soon as the demand of all fits again.
 """
 
@@ -20,7 +20,7 @@ OVERLOADED = 0.9
 KEPT = 0.7
 """Demand of the monitored feeders under overload: the rest is for the receiving thread and HTTP."""
 LASTING = 2
-"""Consecutive windows of overload before feeders are left out."""
+"""Consecutive windows of overload before feeders are shed."""
 LONG_ROUND_S = 0.5
 """Duration of a round, s, that is a sign of overload: ticks of 1 s are late by half a tick."""
 HOLD_S, HOLD_MAX_S = 1.0, 8.0
@@ -28,7 +28,7 @@ HOLD_S, HOLD_MAX_S = 1.0, 8.0
 CALM_S = 60.0
 """Time without overload after which the first hold applies again, s."""
 FLOOD = 2.0
-"""Samples of each meter and tick from which a feeder is left out before all others."""
+"""Samples of each meter and tick from which a feeder is shed before all others."""
 _SMOOTH = 0.3
 """Weight of a new window in the mean costs."""
 
@@ -129,7 +129,7 @@ class LoadControl:
                 self._hold_s = min(HOLD_MAX_S, 2.0 * self._hold_s)
             self._last = now
             if self._overloaded >= LASTING:
-                self._leave_out(kept, now)
+                self._shed_more(kept, now)
         elif self.shed and self._last is not None and now - self._last >= self._hold_s:
             self._take_back(kept)
         if self._last is not None and now - self._last > CALM_S:
@@ -151,8 +151,8 @@ class LoadControl:
                 load.tick_cost_s += (_SMOOTH if load.tick_cost_s else 1.0) * (cost - load.tick_cost_s)
             load.spent_s, load.ticks = 0.0, 0
 
-    def _leave_out(self, kept: float, now: float) -> None:
-        """Leave out feeders: floods first, feeders with active alarms last. At least one stays."""
+    def _shed_more(self, kept: float, now: float) -> None:
+        """Shed feeders: floods first, feeders with active alarms last. At least one stays."""
 
         def order(name: str) -> tuple[bool, bool, str]:
             load = self.feeders[name]
@@ -167,7 +167,7 @@ class LoadControl:
             self.shed[name] = now
 
     def _take_back(self, kept: float) -> None:
-        """Monitor feeders again whose demand fits."""
+        """Monitor feeders again while their demand fits."""
         for name in list(self.shed):
             kept += self.demand(name)
             if kept > KEPT:

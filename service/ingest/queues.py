@@ -115,7 +115,7 @@ class Inbox:
     lossless: when full, block the sender instead of dropping the oldest sample. For `Clock.EVENTS`, where no
         sample gets stale; with the wall clock the oldest samples are worthless. There is one queue then.
     feeder_of: feeder of a key; None for a key without a monitored feeder.
-    shed: feeders whose samples are counted and discarded.
+    shed: feeders with samples that are counted and discarded.
     """
 
     def __init__(

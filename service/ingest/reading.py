@@ -164,7 +164,7 @@ class BadReading:
 
 
 ORDERS_KEPT = 32
-"""Columns of meters of one feeder whose positions are kept."""
+"""Number of columns of meters with kept positions, for each feeder."""
 
 
 @dataclass(frozen=True, slots=True)

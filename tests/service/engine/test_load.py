@@ -1,4 +1,4 @@
-"""Overload: whole feeders are left out, the others are monitored, and all return."""
+"""Overload: whole feeders are shed, the others are monitored, and all return."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Machine:
         self.control.update(self.offered)
 
 
-def test_feeders_are_left_out_under_lasting_overload_and_return_at_once() -> None:
+def test_feeders_are_shed_under_lasting_overload_and_return_at_once() -> None:
     machine = Machine(10)
     for _ in range(5):
         machine.second(50.0)
@@ -67,7 +67,7 @@ def test_feeders_are_left_out_under_lasting_overload_and_return_at_once() -> Non
     assert not machine.shed
 
 
-def test_a_flood_is_left_out_before_its_neighbours_and_alarms_last() -> None:
+def test_a_flood_is_shed_before_its_neighbours_and_alarms_last() -> None:
     machine = Machine(5)
     machine.control.feeders["f0"].standing = True
     for _ in range(4):
@@ -145,7 +145,7 @@ def site() -> Site:
     return load(FEEDER)
 
 
-def test_a_feeder_that_is_left_out_is_undecided_and_no_meter_is_silent(site: Site, tmp_path: Path) -> None:
+def test_a_shed_feeder_is_undecided_and_no_meter_is_silent(site: Site, tmp_path: Path) -> None:
     other = from_tables(replace(site.tables, meta=replace(site.tables.meta, name="other")))
     wall = START + 0.0
     keys = [f"meter/{meter}" for meter in site.meter_ids] + ["substation"]
