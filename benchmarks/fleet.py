@@ -1,6 +1,6 @@
 """Cost of many feeders in one process: time by stage, rates of decoding, meters held at one reading a second.
 
-    python -m benchmarks.fleet [SECONDS] [MOST] [--costs]
+    python -m benchmarks.fleet [SECONDS] [MOST] [OTHER_TREE] [--costs]
 
 Feeders are copies of the Kerber suburban network, 146 meters and the busbar each. All ratios are of one run.
 
@@ -11,12 +11,14 @@ Feeders are copies of the Kerber suburban network, 146 meters and the busbar eac
 3. Fleet: the service is a process of its own, this one publishes each meter once a second for SECONDS. The
    number of feeders grows by half from 8 until a tick is late, a payload is lost or a feeder is shed, or
    until MOST feeders. The last number that is held is printed. With --costs this part is left out.
+   With another source tree only the processor time of the service for a reading is compared, with 8 feeders.
 """
 
 from __future__ import annotations
 
 import json
 import multiprocessing
+import os
 import sys
 import tempfile
 import threading
@@ -384,21 +386,33 @@ class Fleet(threading.Thread):
                 self.behind_s = max(self.behind_s, time.time() - second)
 
 
-def holds(site: Site, folder: Path, number: int, form: str, seconds: float) -> tuple[bool, str]:
-    """True if that many feeders are held; and a line with the figures."""
+OWN = Path(__file__).parents[1]
+
+
+def spent_s(process: int) -> float:
+    """Processor time of a process and all its threads, s."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def holds(
+    site: Site, folder: Path, number: int, form: str, *, seconds: float, tree: Path = OWN
+) -> tuple[bool, float, str]:
+    """True if that many feeders are held; processor time for a reading, s; a line of figures."""
     names = [f"feeder-{k:04d}" for k in range(number)]
-    place = folder / f"{form}-{number}"
+    place = folder / f"{tree.name}-{form}-{number}"
     place.mkdir()
     for name in names:
         write(replace(site.tables, meta=replace(site.tables.meta, name=name)), place / name)
-    with running(Path(__file__).parents[1], place, names) as service:
+    with running(tree, place, names) as service:
         fleet = Fleet(site, names, form, service.zenoh)
         fleet.start()
         try:
             time.sleep(8.0)
             fleet.behind_s = 0.0
-            before, begun = metrics(service), time.monotonic()
+            before, begun, spent = metrics(service), time.monotonic(), spent_s(service.process.pid)
             time.sleep(seconds)
+            cost = spent_s(service.process.pid) - spent
             after, lasted = metrics(service), time.monotonic() - begun
         finally:
             fleet.ended.set()
@@ -411,7 +425,23 @@ def holds(site: Site, folder: Path, number: int, form: str, seconds: float) -> t
     held = clean > 0.98 and lost == 0 and delay < LATE_S and shed == 0
     text = f"{form} {number} feeders, {number * 147} sources: {clean:.3f} of the ticks clean, {lost:.0f} lost"
     text += f", {shed:.0f} shed, mean delay {delay:.2f} s, sender behind by {max(0.0, fleet.behind_s):.2f} s"
-    return held, text
+    cost /= max(1.0, more["gridsec_readings_total"])
+    return held, cost, f"{text}, {1e6 * cost:.1f} us for a reading"
+
+
+def print_against(site: Site, seconds: float, tree: Path) -> None:
+    """Print the ratio of the processor time for a reading to that of another source tree."""
+    with tempfile.TemporaryDirectory() as folder:
+        for form in ("json", "arrow"):
+            costs = []
+            for one in (tree, OWN):
+                _, cost, text = holds(site, Path(folder), FIRST, form, seconds=seconds, tree=one)
+                costs.append(cost)
+                print(f"{one}: {text}", flush=True)
+            print(
+                f"{form}: processor time for a reading, ratio to {tree}: {costs[1] / costs[0]:.2f}",
+                flush=True,
+            )
 
 
 def print_fleet(site: Site, seconds: float, most: int) -> None:
@@ -420,7 +450,7 @@ def print_fleet(site: Site, seconds: float, most: int) -> None:
         for form in ("json", "arrow"):
             best, number = 0, FIRST
             while number <= most:
-                held, text = holds(site, Path(folder), number, form, seconds)
+                held, _, text = holds(site, Path(folder), number, form, seconds=seconds)
                 print(f"{'held' if held else 'not held'}: {text}", flush=True)
                 if not held:
                     break
@@ -434,8 +464,11 @@ TICK_MAX, SINGLES_MIN, BATCHES_MIN = 2.0, 0.3, 5e6
 
 def main() -> int:
     """Measure."""
-    asked = arguments(__doc__, seconds=20.0, most=200, costs=False)
+    asked = arguments(__doc__, seconds=20.0, most=200, against="", costs=False)
     site = load(FEEDER)
+    if asked.against:
+        print_against(site, asked.seconds, Path(asked.against).resolve())
+        return 0
     tick = print_stages(site)
     singles, batches = print_rates(site)
     if not asked.costs:
