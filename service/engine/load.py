@@ -1,8 +1,10 @@
 """Load of the service, and selection of the feeders that it does not monitor under lasting overload.
 
-The demand of a feeder is ``factor (c_s n + c_t / tick_s)``, in seconds of a round for each second: n samples
-offered per second, c_s the time of a sample, c_t that of a tick, and the factor that of everything else in a
-round. Samples of a feeder that is not monitored are counted, so that its demand stays known.
+The demand of a feeder is ``factor (c_s n + c_t / tick_s) / capacity``, in seconds of a round for each
+second: n samples offered per second, c_s the processor time of a sample, c_t that of a tick, and the factor that of
+everything else in a round. The capacity is the processor time of the rounds over their duration: other threads
+and processes take the rest. Samples of a feeder that is not monitored are counted, so that its demand stays
+known.
 
 Under lasting overload whole feeders are shed until the demand of the others is `KEPT`. They return as
 soon as the demand of all fits again.
@@ -19,7 +21,7 @@ OVERLOADED = 0.9
 """Demand from which a window with losses or late rounds is one of overload."""
 KEPT = 0.7
 """Demand of the monitored feeders under overload: the rest is for the receiving thread and HTTP."""
-LASTING = 2
+LASTING = 3
 """Consecutive windows of overload before feeders are shed."""
 LONG_ROUND_S = 0.5
 """Duration of a round, s, that is a sign of overload: ticks of 1 s are late by half a tick."""
@@ -29,6 +31,8 @@ CALM_S = 60.0
 """Time without overload after which the first hold applies again, s."""
 FLOOD = 2.0
 """Samples of each meter and tick from which a feeder is shed before all others."""
+CAPACITY_MIN = 0.1
+"""Smallest capacity: a process that gets less cannot be helped by fewer feeders."""
 _SMOOTH = 0.3
 """Weight of a new window in the mean costs."""
 
@@ -40,7 +44,7 @@ class FeederLoad:
     tick_s: float  # interval of its ticks, s
     sources: int  # number of its meters, the busbar meter included
     standing: bool = False  # it has active alarms
-    spent_s: float = 0.0  # time of its ticks in this window, s
+    spent_s: float = 0.0  # processor time of its ticks in this window, s
     ticks: int = 0  # its ticks in this window
     tick_cost_s: float = 0.0  # mean time of a tick, s
     offered: int = 0  # number of samples until this window
@@ -52,9 +56,10 @@ class Window:
     """Sums of the present window."""
 
     begun: float
-    rounds_s: float = 0.0  # time of all rounds, s
-    placed_s: float = 0.0  # time of decoding and alignment, s
-    judged_s: float = 0.0  # time of ticks, s
+    lasted_s: float = 0.0  # duration of all rounds, s
+    rounds_s: float = 0.0  # processor time of all rounds, s
+    placed_s: float = 0.0  # that of decoding and alignment, s
+    judged_s: float = 0.0  # that of ticks, s
     samples: int = 0  # processed samples
     signs: int = 0  # lost samples, skipped ticks and long rounds
 
@@ -74,21 +79,25 @@ class LoadControl:
     _window: Window | None = None
     _sample_cost_s: float = 0.0
     _factor: float = 1.0
+    _capacity: float = 1.0
     _overloaded: int = 0
     _hold_s: float = HOLD_S
     _last: float | None = None
 
-    def count_round(self, rounds_s: float, placed_s: float, judged_s: float, samples: int) -> None:
-        """Add the times of a round, s, and the number of its samples."""
+    def count_round(
+        self, lasted_s: float, rounds_s: float, placed_s: float, judged_s: float, samples: int
+    ) -> None:
+        """Add the times of a round as in `Window`, s, and the number of its samples."""
         window = self._now()
+        window.lasted_s += lasted_s
         window.rounds_s += rounds_s
         window.placed_s += placed_s
         window.judged_s += judged_s
         window.samples += samples
-        window.signs += rounds_s > LONG_ROUND_S
+        window.signs += lasted_s > LONG_ROUND_S
 
     def count_tick(self, feeder: str, spent_s: float) -> None:
-        """Add the time of a tick, s."""
+        """Add the processor time of a tick, s."""
         load = self.feeders[feeder]
         load.spent_s += spent_s
         load.ticks += 1
@@ -105,7 +114,8 @@ class LoadControl:
     def demand(self, feeder: str) -> float:
         """Return the demand of a feeder."""
         load = self.feeders[feeder]
-        return self._factor * (self._sample_cost_s * load.rate + load.tick_cost_s / load.tick_s)
+        cost = self._sample_cost_s * load.rate + load.tick_cost_s / load.tick_s
+        return self._factor * cost / self._capacity
 
     def update(self, offered: Mapping[str, int]) -> bool:
         """Decide at the end of a window; return True if `shed` has changed.
@@ -122,7 +132,7 @@ class LoadControl:
         for name in before - self.feeders.keys():
             del self.shed[name]
         kept = sum(self.demand(name) for name in self.feeders if name not in self.shed)
-        heavy = window.signs > 0 and max(kept, window.rounds_s / elapsed) > OVERLOADED
+        heavy = window.signs > 0 and max(kept, window.lasted_s / elapsed) > OVERLOADED
         self._overloaded = self._overloaded + 1 if heavy else 0
         if heavy:
             if self._last is not None and now - self._last < CALM_S and not self.shed:
@@ -140,6 +150,9 @@ class LoadControl:
         if window.samples:
             cost = window.placed_s / window.samples
             self._sample_cost_s += (_SMOOTH if self._sample_cost_s else 1.0) * (cost - self._sample_cost_s)
+        if window.lasted_s > 0.0:
+            capacity = min(1.0, max(CAPACITY_MIN, window.rounds_s / window.lasted_s))
+            self._capacity += _SMOOTH * (capacity - self._capacity)
         spent = window.placed_s + window.judged_s
         if spent > 0.0:
             self._factor = min(2.0, max(1.0, window.rounds_s / spent))
