@@ -1,9 +1,9 @@
 """Load of the service, and selection of the feeders that it does not monitor under lasting overload.
 
-The demand of a feeder is ``factor (c_s n + c_t / tick_s) / capacity``, in seconds of a round for each second.
+The demand of a feeder is ``factor (c_s n + c_t / tick_s) / capacity``: seconds of a round for each second.
 n: samples offered per second. c_s: processor time of a sample. c_t: processor time of a tick. factor: that of
-everything else in a round. capacity: processor time of the rounds over their duration; other threads and
-processes take the rest. Samples of a feeder that is not monitored are counted, so that its demand stays known.
+everything else in a round. capacity: processor time of the rounds over their duration; other threads take the
+rest. Samples of a feeder that is not monitored are counted, so that its demand stays known.
 
 Under lasting overload whole feeders are shed until the demand of the others is `KEPT`. They return as
 soon as the demand of all fits again.
