@@ -458,7 +458,7 @@ def print_fleet(site: Site, seconds: float, most: int) -> None:
             print(f"{form}: {best * len(site.meter_ids)} meters", flush=True)
 
 
-TICK_MAX, SINGLES_MIN, BATCHES_MIN = 2.0, 0.3, 5e6
+TICK_MAX, SINGLES_MIN, BATCHES_MIN = 3.0, 0.2, 1e5
 """Limits: a calm tick in steps, single messages over the raw rate, readings per second of batches."""
 
 
