@@ -41,6 +41,8 @@ def timed(totals: dict[str, float], name: str, run: Callable[..., Any]) -> Calla
 
 def main() -> None:
     """Run the service."""
+    # The folder of this file has names of installed packages.
+    sys.path.remove(str(Path(__file__).parent))
     from service.cli.main import main as gridsec
     from service.engine.engine import Engine
 

@@ -47,6 +47,7 @@ class Cause(StrEnum):
     AMBIGUOUS = "ambiguous"
     MISFIT = "misfit"
     DESIGN_INVALID = "design-invalid"
+    OVERLOAD = "overload"
 
 
 class ManipulationKind(StrEnum):

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
+from typing import Any
 
+import numpy as np
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
 from gridsec.estimators.sequential import LearningReason, LearningState
+from service.ingest.align import ReadingOutcome
 from service.ingest.queues import BusCounts
 from service.logs import LineLogger
-from service.report.report import FeederReport
+from service.report.report import LearningReport
+from service.report.tick_state import TickState
 
 _STEP_BUCKETS = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 _DELAY_BUCKETS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 300.0)
@@ -22,6 +27,9 @@ class Metrics:
     def __init__(self) -> None:
         self._registry = CollectorRegistry()
         self._bus_before = asdict(BusCounts())
+        self._children: dict[tuple[Any, ...], Any] = {}
+        self._shown: dict[str, tuple[int, ...]] = {}
+        self._learning: dict[str, tuple[object, object]] = {}
         self._of_readings(self._registry)
         self._of_ticks(self._registry)
         self._of_storing(self._registry)
@@ -59,6 +67,7 @@ class Metrics:
             "gridsec_meters_learning_delayed", "Meters behind schedule, by reason.", ["feeder", "reason"]
         )
         self.alarms = gauge("gridsec_alarms_active", "Active alarms.", ["feeder"])
+        self.shed = gauge("gridsec_feeders_shed", "Feeders that are not monitored because of overload.")
         self.cycle = Histogram(
             "gridsec_cycle_seconds",
             "One round of the runtime: decode, align, estimate, store.",
@@ -67,7 +76,7 @@ class Metrics:
         )
         self.delay = Histogram(
             "gridsec_report_delay_seconds",
-            "Wall time from a tick until its report is stored.",
+            "Wall time from a tick until its result is known and, if it is kept, stored.",
             ["feeder"],
             buckets=_DELAY_BUCKETS,
             registry=registry,
@@ -120,17 +129,62 @@ class Metrics:
             self.bus.labels(what.replace("_", "-")).inc(total - self._bus_before[what])
         self._bus_before = now
 
-    def count_learning(self, report: FeederReport) -> None:
+    def count_readings(self, feeder: str, counts: Mapping[ReadingOutcome, int]) -> None:
+        """Count well-formed readings by outcome."""
+        for outcome, count in counts.items():
+            self._child(self.readings, feeder, outcome.value).inc(count)
+
+    def count_lost(self, feeder: str, count: int) -> None:
+        """Count readings that are missing by their sequence numbers."""
+        self._child(self.lost, feeder).inc(count)
+
+    def count_delay(self, feeder: str, delay_s: float) -> None:
+        """Count the time from a tick to its result."""
+        self._child(self.delay, feeder).observe(delay_s)
+
+    def count_tick(self, state: TickState, alarms: int) -> None:
+        """Count a tick, and show its numbers; `alarms` are the active ones of its feeder.
+
+        Gauges are set when they change.
+        """
+        feeder = state.feeder
+        self._child(self.ticks, feeder, state.verdict.value).inc()
+        gauges = (self.seen, self.suspects, self.alarms)
+        self._show(feeder, gauges, (int(np.count_nonzero(state.tick.seen)), len(state.suspects), alarms))
+        self.count_learning(feeder, state.learning)
+
+    def count_learning(self, feeder: str, learning: LearningReport | None) -> None:
         """Count a feeder's meters by state and reason of learning; unchanged at a tick without a monitor."""
-        if report.learning is None:
+        if learning is None or self._learning.get(feeder) == (learning.states, learning.reasons):
             return
-        for state in LearningState:
-            self.learning.labels(report.feeder, state).set(report.learning.states.count(state))
+        self._learning[feeder] = learning.states, learning.reasons
+        for one in LearningState:
+            self.learning.labels(feeder, one).set(learning.states.count(one))
         for reason in LearningReason:
-            self.delayed.labels(report.feeder, reason).set(report.learning.reasons.count(reason))
+            self.delayed.labels(feeder, reason).set(learning.reasons.count(reason))
+
+    def active(self, feeder: str) -> int:
+        """Return the number of active alarms at the latest tick of a feeder."""
+        return self._shown[feeder][-1] if feeder in self._shown else 0
+
+    def _show(self, feeder: str, gauges: tuple[Gauge, ...], now: tuple[int, ...]) -> None:
+        if self._shown.get(feeder) != now:
+            self._shown[feeder] = now
+            for gauge, value in zip(gauges, now, strict=True):
+                gauge.labels(feeder).set(value)
+
+    def _child(self, metric: Any, *labels: str) -> Any:
+        """The metric with these labels; `labels()` of the library costs as much as counting some readings."""
+        key = (metric, *labels)
+        child = self._children.get(key)
+        if child is None:
+            child = self._children[key] = metric.labels(*labels)
+        return child
 
     def forget(self, feeder: str) -> None:
         """Remove the gauges of a feeder; counters stay."""
+        self._shown.pop(feeder, None)
+        self._learning.pop(feeder, None)
         for gauge in (self.seen, self.suspects, self.learned, self.learning, self.delayed, self.alarms):
             for labels in [sample.labels for m in gauge.collect() for sample in m.samples]:
                 if labels["feeder"] == feeder:

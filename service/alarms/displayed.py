@@ -17,14 +17,13 @@ from typing import Generic, Protocol, TypeVar
 
 from gridsec.interface import Cause, Decision
 from service.alarms.state_machine import AlarmKind, AlarmRules
-from service.report.report import DisplayedVerdict, FeederReport
 
 _UNHEARD = frozenset({Cause.SILENT_METERS, Cause.NO_BUSBAR})
 """Causes of missing readings; the meters may not be silent yet."""
 
 
 class Judged(Protocol):
-    """Tick with a verdict, such as `FeederReport`."""
+    """Tick with a verdict, such as `TickState`."""
 
     @property
     def t(self) -> float:
@@ -75,20 +74,6 @@ def advance(display: Display[T] | None, rules: AlarmRules, tick: T) -> Display[T
     else:
         after = _decided(display, rules, tick)
     return replace(after, t=tick.t)
-
-
-def shown(display: Display[FeederReport]) -> DisplayedVerdict:
-    """Return the displayed verdict for a report."""
-    report = display.newest
-    return DisplayedVerdict(
-        verdict=report.verdict,
-        since=display.since,
-        t=report.t,
-        cause=report.cause,
-        reason=report.reason,
-        suspects=report.suspects,
-        inverters=tuple(inverter.customer for inverter in report.inverters if inverter.suspect),
-    )
 
 
 def _decided(display: Display[T], rules: AlarmRules, tick: T) -> Display[T]:

@@ -13,7 +13,6 @@ from typing import Any
 
 from service.api import models
 from service.report.feeder_info import FeederStatus, status_of
-from service.report.report import BUSBAR, FeederReport
 from service.store import AlarmCounts
 
 _RANK = {status: k for k, status in enumerate(FeederStatus)}
@@ -32,9 +31,7 @@ class Standing:
     """One feeder at the time of the request."""
 
     fields: Mapping[str, Any]  # as of `Backend.feeders`
-    report: FeederReport | None
-    age_s: float | None
-    suspects: int
+    now: Mapping[str, Any]  # numbers of the latest tick, as of `Backend.summary`
     alarms: AlarmCounts
     status: FeederStatus
 
@@ -46,10 +43,8 @@ class Standing:
     @property
     def rank(self) -> tuple[int, int, int, float, str]:
         """Sort key, the worst first: status, suspects, new alarms, earliest start of the verdict, name."""
-        since = None
-        if self.report is not None:
-            since = self.report.since if self.report.displayed is None else self.report.displayed.since
-        return _RANK[self.status], -self.suspects, -self.alarms.raised, since or 0.0, self.name
+        since = self.now.get("displayed_since") or self.now.get("since") or 0.0
+        return _RANK[self.status], -self.now.get("suspects", 0), -self.alarms.raised, since, self.name
 
     def matches(self, words: str) -> bool:
         """True if the name or the title contains a text in lower case."""
@@ -57,33 +52,14 @@ class Standing:
 
     def summary(self) -> models.FeederSummary:
         """Return the entry of the list."""
-        report, now = self.report, {"status": self.status, "alarms": self.alarms.active}
-        now["raised"] = self.alarms.raised
-        if report is not None:
-            now |= {
-                "t": report.t,
-                "verdict": report.verdict,
-                "age_s": self.age_s,
-                "model_only": report.model_only,
-                "since": report.since,
-                "displayed_verdict": None if report.displayed is None else report.displayed.verdict,
-                "displayed_since": None if report.displayed is None else report.displayed.since,
-                "meters": len(report.meters),
-                "suspects": self.suspects,
-                "silent": sum(one.meter != BUSBAR for one in report.silent),
-            }
-        return models.FeederSummary.model_validate({**self.fields, **now})
+        counts = {"status": self.status, "alarms": self.alarms.active, "raised": self.alarms.raised}
+        return models.FeederSummary.model_validate({**self.fields, **counts, **self.now})
 
 
-def standing(
-    fields: Mapping[str, Any], report: FeederReport | None, age_s: float | None, alarms: AlarmCounts | None
-) -> Standing:
-    """Return the state of a feeder from its fields, its latest report with its age, s, and its alarms."""
-    suspects = 0
-    if report is not None:
-        suspects = len(report.suspects) + sum(inverter.suspect for inverter in report.inverters)
-    status = status_of(report, age_s, fields.get("patience_s"), failed=fields.get("phase") == "failed")
-    return Standing(fields, report, age_s, suspects, alarms or _NONE, status)
+def standing(fields: Mapping[str, Any], now: Mapping[str, Any], alarms: AlarmCounts | None) -> Standing:
+    """Return the state of a feeder from its fields, the numbers of its latest tick, and its alarms."""
+    status = status_of(now, fields.get("patience_s"), failed=fields.get("phase") == "failed")
+    return Standing(fields, now, alarms or _NONE, status)
 
 
 def page(

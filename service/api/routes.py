@@ -82,6 +82,9 @@ class Backend(Protocol):
     def report(self, name: str) -> FeederReport | None:
         """Return the latest report of a feeder, or None before its first tick."""
 
+    def summary(self, name: str) -> dict[str, Any]:
+        """Return the numbers of a feeder in the list of feeders; empty before its first tick."""
+
     def age(self, report: FeederReport) -> float:
         """Return the age of a feeder's latest report by the service's clock, s."""
 
@@ -466,12 +469,11 @@ def list_feeders(
 ) -> models.Feeders:
     """All feeders with the latest verdict of each, or a page of them, the worst first."""
     alarms = backend.store.alarms_by_feeder()
-    found = []
-    for fields in backend.feeders():
-        if caller.sees(name := fields["name"]):
-            report = backend.report(name)
-            age = None if report is None else backend.age(report)
-            found.append(overview.standing(fields, report, age, alarms.get(name)))
+    found = [
+        overview.standing(fields, backend.summary(name), alarms.get(name))
+        for fields in backend.feeders()
+        if caller.sees(name := fields["name"])
+    ]
     part = (offset, limit)
     return overview.page(found, order=order, text=text, status=status, include=include, part=part)
 

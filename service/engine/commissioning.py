@@ -262,6 +262,8 @@ class FeederCommissioning:
         found = self._found(known)
         if known is None or found is None:
             return LearningReport()
+        if LearningState.STALLED not in found.state:
+            return LearningReport(found.state, found.reason, found.expected_s)
         gathered = np.zeros(len(found.state)) if known.learning is None else known.learning.time_s
         stalled = tuple(
             StalledMeter(meter, found.reason[k], float(gathered[k]))

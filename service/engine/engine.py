@@ -11,6 +11,7 @@ see `service.store.committer`.
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -40,31 +41,28 @@ from service.alarms.state_machine import (
 from service.alarms.state_machine import to_json as alarm_json
 from service.engine.commissioning import CommissioningProgress, FeederCommissioning
 from service.engine.feeder_monitor import FeederMonitor, Suspicions, TickResult, align_rules, known_of
+from service.engine.load import FeederLoad, LoadControl
 from service.engine.operators import SHELVE_MOST_S, Operators
 from service.errors import FeederUnknown
-from service.ingest.align import Clock, ReadingOutcome
-from service.ingest.queues import Sample
-from service.ingest.reading import (
-    HEAD_BYTES,
-    BadReading,
-    BadReason,
-    DecodedPayload,
-    Reading,
-    Wire,
-    beginning,
-    head_of,
-)
+from service.ingest.align import Clock
+from service.ingest.queues import Inbox, Sample
+from service.ingest.reading import BadReading, BadReason, Reading, Readings, Wire, head_of
 from service.metrics import Metrics
-from service.report.report import BUSBAR, FeederReport, to_text
+from service.report.report import BUSBAR, FeederReport
+from service.report.tick_state import TickState
 from service.store import Rejected, Store
 from service.store.committer import Committer, Executor, Wish, alarm_key, incident_key, inline
 from service.store.schema import CommissioningEvent
 from service.store.state_codec import StateSnapshot
+from service.store.store import Mark, mark, worth_keeping
 
 BAD_PER_SOURCE = 5
 """Bad readings of one round, key and reason that are stored separately; the others become one entry."""
 BAD_PER_ROUND = 50
 """Largest number of entries for bad readings of a round."""
+
+SAMPLES_AT_ONCE = 4096
+"""Payloads that are decoded together; a stop of the service waits for no more."""
 
 T = TypeVar("T")
 
@@ -244,6 +242,10 @@ class Engine:
         self.committer = Committer(store, self.metrics, stored, self._count_stored, apart, wall=wall)
         self.operators = Operators(self, wall, config.shelve_most_s)
         self._wire = Wire({}, config.prefix, config.max_payload, config.meter_keys)
+        self._marks: dict[str, Mark] = {}
+        self._wakes: dict[str, float] = {}
+        self._until = -math.inf
+        self.load = LoadControl(clock)
         for site in sites:
             self.add(site)
 
@@ -265,6 +267,9 @@ class Engine:
         twice = [alarm for alarm in past.alarms if alarm.id not in held]
         self.committer.waiting.add(transitions=close(twice, self._wall(), TOLD_TWICE))
         self.monitors = {**self.monitors, name: monitor}
+        self._wakes[name] = -math.inf
+        settings = site.tables.meta.monitor
+        self.load.feeders[name] = FeederLoad(settings.tick_s, len(site.meter_ids) + 1)
         self.unloaded.pop(name, None)
         self._learn()
         return monitor
@@ -335,6 +340,9 @@ class Engine:
     def _removed(self, name: str) -> None:
         self.unloaded.pop(name, None)
         self.monitors = {other: kept for other, kept in self.monitors.items() if other != name}
+        self._wakes.pop(name, None)
+        self._marks.pop(name, None)
+        self.load.feeders.pop(name, None)
         self.committer.waiting.forget(name)
         self._learn()
         self.metrics.forget(name)
@@ -368,65 +376,125 @@ class Engine:
 
     # ---------------------------------------------------------------- one round
 
-    def cycle(self, samples: list[Sample], oldest: Callable[[], float | None] = lambda: None) -> bool:
+    def cycle(self, samples: list[Sample], oldest: Callable[[], Mapping[str, float]] = dict) -> bool:
         """Process samples and due ticks, store, publish.
 
-        `oldest` returns the arrival time of the oldest waiting sample, Unix s; None if none waits. Returns
-        True if there is a new report.
+        `oldest` returns the arrival time of the oldest waiting sample of feeders, Unix s. Returns True if
+        there is a new report.
         """
-        started = time.perf_counter()
+        started, begun = time.perf_counter(), time.thread_time()
         bad = self._place(samples)
-        now, waiting = self._wall(), oldest()
-        # A tick must not end before samples that arrived in time have left the queue.
-        until = now if waiting is None else min(now, waiting)
-        for monitor in self.monitors.values():
-            self._guarded(monitor, partial(monitor.reach, until))
+        self._reach(self._wall(), oldest())
+        placed = time.thread_time()
         results = self._judge()
+        judged = time.thread_time()
         entries, left_out = some_of_each(bad)
         self.committer.waiting.add(rejected=entries)
         self.metrics.forgotten.labels("bad-reading").inc(left_out)
         for result in results:
-            self.committer.waiting.add(transitions=result.transitions, reports=(result.report,))
-            self._count_tick(result.report)
-            self.reported[result.report.feeder] = time.monotonic()
-        judged = {result.report.feeder for result in results}
-        self.keep_states(monitor for name, monitor in self.monitors.items() if name in judged)
+            monitor = self.monitors[result.state.feeder]
+            reports = self._guarded(monitor, partial(self._history, result.state)) or ()
+            self.committer.waiting.add(transitions=result.transitions, reports=reports)
+            self.metrics.count_tick(result.state, len(monitor.book.active))
+            self.reported[monitor.name] = time.monotonic()
+            self.keep_states((monitor,))
         self.committer.commit()
         self._publish_estimates(results)
+        lasted = time.perf_counter() - started
         if samples or results:
-            self.metrics.cycle.observe(time.perf_counter() - started)
+            self.metrics.cycle.observe(lasted)
+        spent = time.thread_time() - begun
+        self.load.count_round(lasted, spent, placed - begun, judged - placed, len(samples))
         return bool(results)
+
+    def control(self, inbox: Inbox, dropped: int) -> None:
+        """Under lasting overload, stop monitoring some feeders, and begin again as soon as the load fits.
+
+        `dropped` is the number of samples that the queue has dropped since the last call.
+        """
+        self.load.count_losses(dropped)
+        for name, load in self.load.feeders.items():
+            load.standing = bool(self.metrics.active(name))
+        if not self.load.update(inbox.offered()):
+            return
+        shed = frozenset(self.load.shed)
+        changed = sorted(shed ^ inbox.shed)
+        inbox.shed = shed
+        for name in changed:
+            inbox.forget(name)
+            self.monitors[name].set_shed(name in shed)
+            self._set_wake(self.monitors[name])
+        self.metrics.shed.set(len(shed))
+        _log.warning("feeders are shed because of overload", feeders=len(shed), changed=changed[:SHOWN])
+
+    def _reach(self, now: float, waiting: Mapping[str, float]) -> None:
+        """Add the ticks that are due at the wall time `now`, Unix s, to the pending ones.
+
+        A tick must not end before samples that arrived in time have left the queue: `waiting` as in `cycle`.
+        """
+        back, before, self._until = now < self._until, self._until, now
+        for name, monitor in self.monitors.items():
+            until = min(now, waiting.get(name, now))
+            if back:
+                # The alignment detects a clock that is set back by the latest time that it has reached.
+                self._guarded(monitor, partial(monitor.reach, before))
+            if back or self._wakes[name] <= until:
+                self._guarded(monitor, partial(monitor.reach, until))
+                self._set_wake(monitor)
+
+    def _set_wake(self, monitor: FeederMonitor) -> None:
+        """Note the latest time of a monitor's next tick; at `Clock.EVENTS` only readings cause one."""
+        wake = monitor.aligner.wake()
+        self._wakes[monitor.name] = math.inf if wake is None else wake
+
+    @property
+    def wake(self) -> float:
+        """Latest wall time of the next tick, Unix s; infinite if only readings can cause one."""
+        return min(self._wakes.values(), default=math.inf)
+
+    def _history(self, state: TickState) -> tuple[FeederReport, ...]:
+        """The part of the report that the history keeps, if any: the store selects by the same rule."""
+        now = mark(state)
+        if not worth_keeping(self._marks.get(state.feeder), now, self.store.history_rules):
+            self._count_delay(state.feeder, state.t)
+            return ()
+        self._marks[state.feeder] = now
+        return (state.kept(),)
 
     @property
     def behind(self) -> bool:
         """True while due ticks wait for the next round."""
         return any(monitor.pending for monitor in self.monitors.values())
 
-    def _place(self, samples: Iterable[Sample]) -> list[Rejected]:
+    def _place(self, samples: Sequence[Sample]) -> list[Rejected]:
         """Decode and align samples without evaluation; return the unusable readings."""
         bad: list[Rejected] = []
-        outcomes: Counter[tuple[str, ReadingOutcome]] = Counter()
-        lost: dict[str, int] = {}
-        for sample in samples:
+        for begin in range(0, len(samples), SAMPLES_AT_ONCE):
             if not self._continues():
                 break
-            decoded = self._decode(sample)
-            bad.extend(self._note(problem, sample) for problem in decoded.bad)
-            self._refuse_identities(decoded.bad)
-            for reading in decoded.readings:
-                monitor = self.monitors[reading.feeder]
-                lost.setdefault(monitor.name, monitor.aligner.lost)
-                outcome = self._guarded(monitor, partial(monitor.place, reading, sample.arrival))
-                if outcome is not None:
-                    outcomes[monitor.name, outcome] += 1
-                if outcome is ReadingOutcome.CLOCK_OFF:
-                    bad.append(self._clock_off(reading, sample.arrival))
-                bad.extend(self._clock_off(refused, sample.arrival) for refused in monitor.aligner.refused())
-        for (name, outcome), count in outcomes.items():
-            self.metrics.readings.labels(name, outcome).inc(count)
-        for name, before in lost.items():
-            self.metrics.lost.labels(name).inc(self.monitors[name].aligner.lost - before)
-        return bad
+            gathered = self._wire.gather(samples[begin : begin + SAMPLES_AT_ONCE])
+            bad.extend(self._note(problem, sample) for problem, sample in gathered.bad)
+            self._refuse_identities(problem for problem, _ in gathered.bad)
+            for name, readings in gathered.readings.items():
+                bad.extend(self._align(self.monitors[name], readings))
+        # Rejected readings are stored in the order of their arrival.
+        return sorted(bad, key=lambda one: one.t)
+
+    def _align(self, monitor: FeederMonitor, readings: Readings) -> Iterable[Rejected]:
+        """Align the readings of a feeder; yield those with a wrong clock."""
+        name, lost = monitor.name, monitor.aligner.lost
+        placed = self._guarded(monitor, partial(monitor.place_all, readings))
+        self._set_wake(monitor)
+        self.metrics.count_lost(name, monitor.aligner.lost - lost)
+        if placed is None:
+            return
+        self.metrics.count_readings(name, placed.counts)
+        known = self._wire.known[name]
+        for k in placed.clock_off:
+            yield self._clock_off(readings.reading(k, known), float(readings.arrival[k]))
+        for refused in monitor.aligner.refused():
+            reading = msgspec.structs.replace(refused, feeder=name)
+            yield self._clock_off(reading, float(readings.arrival[-1]))
 
     def _refuse_identities(self, bad: Iterable[BadReading]) -> None:
         """Pass readings with a wrong signature or sender to the monitors of their feeders."""
@@ -444,9 +512,11 @@ class Engine:
         results: list[TickResult] = []
 
         def judge(monitor: FeederMonitor) -> None:
-            skipped = monitor.skipped
+            skipped, begun = monitor.skipped, time.thread_time()
             result = self._guarded(monitor, monitor.judge)
+            self.load.count_tick(monitor.name, time.thread_time() - begun)
             if monitor.skipped > skipped:
+                self.load.count_losses(monitor.skipped - skipped)
                 self.metrics.skipped.labels(monitor.name).inc(monitor.skipped - skipped)
                 self._catch_up.skipped(monitor.name, monitor.skipped - skipped)
             if result is not None:
@@ -474,22 +544,6 @@ class Engine:
         if known is not None:
             self.metrics.learned.labels(monitor.name).set(np.isfinite(known.learned.at).sum())
 
-    def _decode(self, sample: Sample) -> DecodedPayload:
-        """Decode a payload; a defect of the decoder costs this payload only."""
-        try:
-            return self._wire.decode(
-                sample.key,
-                sample.payload,
-                sample.encoding,
-                size=sample.size,
-                attachment=sample.attachment,
-            )
-        except Exception as error:  # noqa: BLE001 - one payload must not end the service
-            problem = beginning(f"{type(error).__name__}: {error}")
-            _log.error("a payload could not be decoded", key=sample.key[:HEAD_BYTES], problem=problem)
-            head, key = head_of(sample.payload[:HEAD_BYTES]), beginning(sample.key)
-            return DecodedPayload(bad=(BadReading(BadReason.INTERNAL, (problem,), key, head=head),))
-
     def _guarded(self, monitor: FeederMonitor, run: Callable[[], T]) -> T | None:
         """Run a step of one feeder; a defect stops this feeder, visibly, and no other."""
         found: T | None = None
@@ -515,18 +569,12 @@ class Engine:
         return Rejected(arrival, key, reason, head_of(reading).encode())
 
     def _count_stored(self, reports: tuple[FeederReport, ...]) -> None:
-        if self.config.clock is Clock.WALL:
-            now = self._wall()
-            for report in reports:
-                self.metrics.delay.labels(report.feeder).observe(max(0.0, now - report.t))
+        for report in reports:
+            self._count_delay(report.feeder, report.t)
 
-    def _count_tick(self, report: FeederReport) -> None:
-        metrics, name = self.metrics, report.feeder
-        metrics.ticks.labels(name, report.verdict).inc()
-        metrics.seen.labels(name).set(sum(meter.seen for meter in report.meters))
-        metrics.suspects.labels(name).set(len(report.suspects))
-        metrics.count_learning(report)
-        metrics.alarms.labels(name).set(len(self.monitors[name].book.active))
+    def _count_delay(self, feeder: str, t: float) -> None:
+        if self.config.clock is Clock.WALL:
+            self.metrics.count_delay(feeder, max(0.0, self._wall() - t))
 
     # ---------------------------------------------------------------- publishing
 
@@ -534,8 +582,7 @@ class Engine:
         if self.committer.publisher is None:
             return
         for result in results:
-            key = f"{result.report.feeder}/estimate"
-            self.committer.publisher.telemetry(key, to_text(result.report))
+            self.committer.publisher.telemetry(f"{result.state.feeder}/estimate", result.state.text)
         self.metrics.count_bus(self.committer.publisher.counts)
 
     # ---------------------------------------------------------------- operators

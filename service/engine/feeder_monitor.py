@@ -6,6 +6,7 @@ The live service, replay and tests all use it. It has no clock, no threads and n
 
 from __future__ import annotations
 
+import math
 import os
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -26,20 +27,11 @@ from service.alarms import displayed
 from service.alarms.conditions import conditions, identity_mismatches
 from service.alarms.state_machine import INCIDENT_S, AlarmBook, AlarmRules, AlarmTransition, advance, hold
 from service.engine.commissioning import FeederCommissioning
-from service.ingest.align import Aligner, AlignRules, Clock, ReadingOutcome, Tick, rules
-from service.ingest.reading import Known, Reading
+from service.ingest.align import Aligner, AlignRules, Clock, Placed, ReadingOutcome, Tick, rules
+from service.ingest.reading import Known, Reading, Readings
 from service.report import feeder_info
-from service.report.report import (
-    BUSBAR,
-    DataErrors,
-    FeederReport,
-    blind,
-    build,
-    busbar_phases,
-    snapshot,
-    with_data_error,
-    with_learning,
-)
+from service.report.report import BUSBAR, DataErrors, FeederReport, busbar_phases, snapshot
+from service.report.tick_state import TickState
 from service.store.state_codec import KeptInvalid, StateSnapshot, decode_distrust, encode_distrust
 
 
@@ -109,6 +101,8 @@ POWER_MAX_FACTOR = 100.0
 
 MISMATCH_S = 60.0
 """Time for which a refused identity is a condition, s; at least two ticks."""
+OVERLOAD_REASON = "not monitored: the service is overloaded, and discards the readings of this feeder"
+
 PATIENCE_MIN_S = 5.0
 """Lower limit of `patience_s`, s."""
 
@@ -125,8 +119,13 @@ class Phase(StrEnum):
 class TickResult:
     """Result of one tick."""
 
-    report: FeederReport
+    state: TickState
     transitions: tuple[AlarmTransition, ...]
+
+    @property
+    def report(self) -> FeederReport:
+        """Its report."""
+        return self.state.report
 
 
 def known_of(site: Site) -> Known:
@@ -134,7 +133,7 @@ def known_of(site: Site) -> Known:
     meta = site.tables.meta
     nominal = zip(site.meter_ids, site.customer_nominal[site.meters].tolist(), strict=True)
     own = {meter: volt for meter, volt in nominal if volt != meta.voltage_volt}
-    return Known(frozenset(site.meter_ids), meta.voltage_volt, POWER_MAX_FACTOR * meta.base_kva, own)
+    return Known(site.meter_ids, meta.voltage_volt, POWER_MAX_FACTOR * meta.base_kva, own)
 
 
 def align_rules(
@@ -176,9 +175,10 @@ class FeederMonitor:
     """Monitor of one feeder.
 
     phase, problem: state of the monitor, and the reason of a failure.
-    report: the latest report, or None before the first tick.
+    latest: result of the latest tick, or None before the first one.
     pending: ticks that are due and not evaluated, oldest first.
     skipped: number of skipped ticks.
+    shed: True while it is not monitored because of overload.
     defect: error that ended the monitor, until it is logged; None without one.
     rules: times of its alignment.
     book: its alarms so far.
@@ -203,12 +203,13 @@ class FeederMonitor:
         self.suspicions = suspicions or Suspicions(site)
         self.phase = Phase.DESIGNING
         self.problem = ""
-        self.report: FeederReport | None = None
+        self.latest: TickState | None = None
         self.pending: deque[Tick] = deque()
         self.skipped = 0
+        self.shed = False
         self.defect: Exception | None = None
         self._alarm_rules = alarm_rules(site, rules)
-        self._display: displayed.Display[FeederReport] | None = None
+        self._display: displayed.Display[TickState] | None = None
         self._data_errors = DataErrors(site)
         self._power_ages = PowerAges(site)
         # Meters that have had no reading since the start and are not silent yet.
@@ -218,6 +219,11 @@ class FeederMonitor:
         self._mismatches: dict[str, tuple[float, str]] = {}
         self._watcher: registry.DesignedEstimator | None = None
         self._state: Any = None
+
+    @property
+    def report(self) -> FeederReport | None:
+        """The latest report, or None before the first tick."""
+        return None if self.latest is None else self.latest.report
 
     @property
     def patience_s(self) -> float:
@@ -273,6 +279,12 @@ class FeederMonitor:
         }
         return {meter: problem for meter, (_, problem) in self._mismatches.items()}
 
+    def place_all(self, readings: Readings) -> Placed:
+        """Align readings in the order of their arrival; ticks that become due are pending."""
+        placed = self.aligner.take_all(readings)
+        self.pending.extend(placed.ticks)
+        return placed
+
     def reach(self, now: float) -> None:
         """Add the ticks that are due without a new reading to the pending ones."""
         self.pending.extend(self.aligner.due(now))
@@ -291,6 +303,11 @@ class FeederMonitor:
         tick = self.pending.popleft()
         self.skipped += tick.skipped
         return self._result(tick)
+
+    def set_shed(self, shed: bool) -> None:
+        """Begin or end the time without monitoring; it is no evidence of silence."""
+        self.shed = shed
+        self.aligner.excuse()
 
     def finish(self) -> None:
         """Add all ticks that the time has reached to the pending ones: the input has ended."""
@@ -319,52 +336,54 @@ class FeederMonitor:
         mismatches = identity_mismatches(self.name, self._mismatched(tick.t))
         for _ in range(2):  # monitored, then failed
             try:
-                report, display = self._complete(self._judge(tick))
-                found = [*conditions(report, connecting=self._connects(report)), *mismatches]
-                after, transitions = advance(book, self._alarm_rules, found, report.t)
+                state, display = self._complete(self._judge(tick))
+                subjects = {subject for _, subject in book.entries}
+                notable = state.notable(subjects)
+                connecting = self._connects(tick)
+                found = [] if notable is None else conditions(notable, connecting=connecting)
+                after, transitions = advance(book, self._alarm_rules, [*found, *mismatches], state.t)
             except Exception as error:  # noqa: BLE001 - ticks before and after keep their verdicts
                 self.break_down(error)
             else:
-                self.report, self.book, self._display = report, after, display
-                return TickResult(report, transitions)
-        self.report, self._display = self._complete(self._judge(tick))
-        return TickResult(self.report, ())
+                self.latest, self.book, self._display = state, after, display
+                return TickResult(state, transitions)
+        self.latest, self._display = self._complete(self._judge(tick))
+        return TickResult(self.latest, ())
 
-    def _connects(self, report: FeederReport) -> bool:
+    def _connects(self, tick: Tick) -> bool:
         """True while a meter has had no reading since the start and is not silent yet."""
         if self._connecting:
-            self._connecting -= {meter.meter for meter in report.meters if meter.seen}
-            self._connecting -= {one.meter for one in report.silent}
-            if report.busbar.seen:
+            self._connecting -= {self.site.meter_ids[k] for k in np.flatnonzero(tick.seen)}
+            self._connecting -= {BUSBAR if meter is None else meter for meter, _ in tick.silent}
+            if math.isfinite(tick.busbar_volt):
                 self._connecting.discard(BUSBAR)
         return bool(self._connecting)
 
-    def _complete(self, report: FeederReport) -> tuple[FeederReport, displayed.Display[FeederReport]]:
-        """The report with revision, newest tick with a reading, and start and display of the verdict."""
-        before = self.report
+    def _complete(self, state: TickState) -> tuple[TickState, displayed.Display[TickState]]:
+        """The result with revision, newest tick with a reading, and start and display of the verdict."""
+        before = self.latest
         last = None if before is None else before.t_measured
-        goes_on = before is not None and before.verdict is report.verdict and before.t < report.t
-        since = before.since if before is not None and goes_on else report.t
+        goes_on = before is not None and before.verdict is state.verdict and before.t < state.t
+        since = before.since if before is not None and goes_on else state.t
         # After the clock was set back, an earlier time of measurement would be in the future.
-        measured = (last if last is None or last <= report.t else None) if report.model_only else report.t
-        display = displayed.advance(self._display, self._alarm_rules, report)
-        complete = replace(
-            report,
-            revision=self.revision,
-            t_measured=measured,
-            since=since,
-            displayed=displayed.shown(display),
-        )
-        return complete, display
+        measured = (last if last is None or last <= state.t else None) if state.model_only else state.t
+        state = replace(state, revision=self.revision, t_measured=measured, since=since)
+        display = displayed.advance(self._display, self._alarm_rules, state)
+        return replace(state, displayed=(display.newest, display.since)), display
 
-    def _judge(self, tick: Tick) -> FeederReport:
+    def _judge(self, tick: Tick) -> TickState:
+        if self.shed:
+            # Its readings are discarded unread: no meter is silent.
+            return TickState(
+                self.site, replace(tick, silent=()), self.max_attacked, Cause.OVERLOAD, OVERLOAD_REASON
+            )
         if self._watcher is None:
             if self.phase is Phase.FAILED:
                 cause, reason = Cause.DESIGN_INVALID, f"not monitored: {self.problem}"
             else:
                 cause, reason = Cause.SETTLING, "the design of the monitor is not finished"
-            return blind(self.site, tick, self.max_attacked, cause, reason)
-        if self._state is None or (self.report is not None and tick.t <= self.report.t):
+            return TickState(self.site, tick, self.max_attacked, cause, reason)
+        if self._state is None or (self.latest is not None and tick.t <= self.latest.t):
             # The first tick, or the clock was set back: earlier readings belong to another time.
             begun = self._watcher.init(tick.t, self.commissioning.known)
             self._state = self.suspicions.restore(begun)
@@ -374,6 +393,13 @@ class FeederMonitor:
         self._state, estimate, verdict = self._watcher.step(self._state, frame)
         self.commissioning.follow(self._state, tick.t)
         self.suspicions.follow(self._state, tick.t)
-        report = build(self.site, tick, self.max_attacked, estimate, verdict)
-        report = with_data_error(report, self._data_errors.follow(frame, estimate, verdict))
-        return with_learning(report, self.commissioning.report())
+        return TickState(
+            self.site,
+            tick,
+            self.max_attacked,
+            verdict.cause,
+            estimate=estimate,
+            judgement=verdict,
+            learning=self.commissioning.report(),
+            data_error=self._data_errors.follow(frame, estimate, verdict),
+        )

@@ -96,7 +96,7 @@ def _counted(monitor: FeederMonitor, results: Iterator[TickResult], tally: Repla
     found = list(results)
     if monitor.defect is not None:
         raise monitor.defect
-    tally.ticks.update(str(result.report.verdict) for result in found)
+    tally.ticks.update(str(result.state.verdict) for result in found)
     return found
 
 

@@ -34,6 +34,7 @@ from service.ingest.queues import Inbox, Sample
 from service.metrics import Metrics
 from service.report import feeder_info
 from service.report.report import FeederReport
+from service.report.tick_state import TickState
 from service.store import OutcomeUnknown, Store, StoreUnavailable
 from service.store.committer import Publisher, WriteResult
 
@@ -94,7 +95,10 @@ class Runtime:
             lambda: self._in_loop(self._wake.set),
             max_samples=config.max_samples,
             lossless=self._waits,
+            feeder_of=self._feeder_of,
         )
+        self._prefix = f"{config.prefix}/"
+        self._dropped = 0
         self._commands: deque[tuple[Callable[[], Future[Any]], asyncio.Future[Any]]] = deque()
         self._prepared: set[asyncio.Future[tuple[Site, DesignedEstimator]]] = set()
         self._subscribers: set[asyncio.Queue[str]] = set()
@@ -108,6 +112,11 @@ class Runtime:
 
     # ---------------------------------------------------------------- the task
 
+    def _feeder_of(self, key: str) -> str | None:
+        """Monitored feeder of a zenoh key, or None."""
+        name = key.removeprefix(self._prefix).partition("/")[0]
+        return name if name in self._engine.monitors else None
+
     def attach(self, publisher: Publisher) -> None:
         """Set the publisher of estimates and alarms; called before `run`."""
         self._engine.committer.publisher = publisher
@@ -117,6 +126,7 @@ class Runtime:
         dropped = self._inbox.put(batch)
         self._engine.metrics.samples.inc(len(batch))
         self._engine.metrics.dropped.inc(dropped)
+        self._dropped += dropped
         return dropped
 
     async def run(self) -> None:
@@ -132,8 +142,7 @@ class Runtime:
             while not self._stopping:
                 self._check_writer()
                 await self._execute_commands()
-                samples = self._samples()
-                news = await self._in_worker(self._engine.cycle, samples, self._inbox.oldest)
+                news = await self._in_worker(self._round)
                 self._last_round = time.monotonic()
                 self._engine.metrics.queue.set(len(self._inbox))
                 if news:
@@ -150,6 +159,13 @@ class Runtime:
                 answer.cancel()
             self._worker.shutdown(wait=False)
             self._writer.shutdown(wait=False)
+
+    def _round(self) -> bool:
+        news = self._engine.cycle(self._samples(), self._inbox.oldest)
+        if not self._waits:
+            dropped, self._dropped = self._dropped, 0
+            self._engine.control(self._inbox, dropped)
+        return news
 
     def _check_writer(self) -> None:
         if (lost := self.store.lost) is not None:
@@ -182,8 +198,7 @@ class Runtime:
             await asyncio.sleep(0.0 if self._waits else GATHER_S)
             return
         now = self._wall()
-        wakes = [t for monitor in self._engine.monitors.values() if (t := monitor.aligner.wake()) is not None]
-        timeout = min([IDLE_S, *(t - now for t in wakes)])
+        timeout = min(IDLE_S, self._engine.wake - now)
         if timeout > 0.0:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._wake.wait(), timeout)
@@ -347,7 +362,13 @@ class Runtime:
         monitor = self._engine.monitors.get(name)
         return None if monitor is None else monitor.report
 
-    def age(self, report: FeederReport) -> float:
+    def summary(self, name: str) -> dict[str, Any]:
+        """Return the numbers of a feeder in the list of feeders; empty before its first tick."""
+        monitor = self._engine.monitors.get(name)
+        latest = None if monitor is None else monitor.latest
+        return {} if latest is None else {**latest.summary(), "age_s": self.age(latest)}
+
+    def age(self, report: FeederReport | TickState) -> float:
         """Return the age of a feeder's latest report by the service's clock, s.
 
         With `Clock.EVENTS` the age counts from the creation of the report.
@@ -400,9 +421,11 @@ class Runtime:
             elif monitor.phase is Phase.FAILED:
                 problems.append(f"feeder {monitor.name}: {monitor.problem}")
             # With `Clock.EVENTS` the time may stand still.
-            told, waits = monitor.report, engine.config.clock is Clock.WALL
+            told, waits = monitor.latest, engine.config.clock is Clock.WALL
             if waits and told is not None and (age := self.age(told)) > monitor.patience_s:
                 problems.append(f"feeder {monitor.name}: the latest report is {age:.0f} s old")
+        if shed := len(self._inbox.shed):
+            problems.append(f"overload: {shed} of {len(engine.monitors)} feeders are not monitored")
         for name, problem in engine.unloaded.copy().items():
             problems.append(f"feeder {name}: {problem}")
         return not problems, problems

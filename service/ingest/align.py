@@ -12,6 +12,9 @@ before it is younger than `max_age_s`; at short ticks a single lost reading has 
 as soon as every source that is not silent has reported for it, and at the latest `grace_s` after it. Later
 readings are late: counted, and used for the next tick if still fresh. Silence does not stop the ticks.
 
+The readings of a round are columns (`Readings`). Runs of readings in order, between two ticks, are placed
+together; any other reading is placed alone. The result does not depend on the way.
+
 The alignment has no clock. `now` is an argument (the wall clock) or follows from the readings
 (`Clock.EVENTS`: the latest time that at least half of the sources have reached, so that a few wrong clocks
 cannot move it; for replay and for accelerated time). The same readings in the same order, with the same
@@ -22,16 +25,18 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, insort
-from collections import Counter, OrderedDict, deque
+from collections import Counter, OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from itertools import zip_longest
-from statistics import median
 from typing import Final
 
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid, Problem
-from service.ingest.reading import Reading
+from service.ingest.reading import COLUMNS, NO_SEQ, V_VOLT, Reading, Readings, T
 
 KEPT: Final = 64
 """Newest arrivals of a source that its median delay uses."""
@@ -61,57 +66,104 @@ class ClockOffsets:
     """
 
     def __init__(self, sources: Iterable[str | None], tick_s: float, silence_s: float) -> None:
-        self._delays: dict[str | None, deque[float]] = {source: deque(maxlen=KEPT) for source in sources}
-        self._arrived: dict[str | None, float] = {}
+        self._sources = tuple(sources)
+        size = len(self._sources)
+        self._index = {source: k for k, source in enumerate(self._sources)}
+        # Rings of the newest delays: column k holds `count[k]` of them, infinity elsewhere.
+        self._delays = np.full((KEPT, size), np.inf)
+        self._count = np.zeros(size, dtype=np.intp)
+        self._newest = np.full(size, KEPT - 1)
+        self._arrived = np.full(size, np.nan)
         self._least = max(LEAST_S, LEAST_TICKS * tick_s)
         self._silence = silence_s
-        self._reported: set[str | None] = set()
+        self._reported = np.zeros(size, dtype=np.bool_)
 
     def note(self, source: str | None, t: float, arrival: float) -> None:
         """Add the delay of one reading. `source` is the meter, None for the busbar meter; times in Unix s."""
-        delays = self._delays[source]
-        if self._arrived.get(source) == arrival:
-            delays[-1] = min(delays[-1], arrival - t)
-            return
-        self._arrived[source] = arrival
-        delays.append(arrival - t)
+        k = self._index[source]
+        self.note_all(np.array([k]), np.array([t]), np.array([arrival]))
+
+    def note_all(self, source: Ints, t: Floats, arrival: Floats) -> None:
+        """Add the delays of readings, (n,), grouped by source, those of each in the order of arrival."""
+        of, arrived, delay = source, arrival, arrival - t
+        again = source[1:] == source[:-1]
+        if again.any():
+            at = np.flatnonzero(np.concatenate(([True], ~again | (arrival[1:] != arrival[:-1]))))
+            of, arrived, delay = source[at], arrival[at], np.minimum.reduceat(delay, at)
+        # The first instant of a source may go on with its newest one.
+        same = self._arrived[of] == arrived
+        if same.any():
+            same[1:] &= of[1:] != of[:-1]
+            old = of[same]
+            newest = self._newest[old]
+            self._delays[newest, old] = np.minimum(self._delays[newest, old], delay[same])
+            of, arrived, delay = of[~same], arrived[~same], delay[~same]
+        if of.size:
+            place = (self._newest[of] + 1 + _rank(of)) % KEPT
+            self._delays[place, of] = delay
+            self._newest[of], self._arrived[of] = place, arrived
+            self._count += np.bincount(of, minlength=self._count.size)
+            np.minimum(self._count, KEPT, out=self._count)
 
     def forget(self) -> None:
         """Delete all delays: the wall clock was set."""
-        for delays in self._delays.values():
-            delays.clear()
-        self._arrived.clear()
-        self._reported.clear()
+        self._delete(np.ones(self._count.size, dtype=np.bool_))
+        self._reported[:] = False
+
+    def _delete(self, which: Bools) -> None:
+        self._delays[:, which] = np.inf
+        self._count[which] = 0
+        self._arrived[which] = np.nan
 
     def measured(self, now: float) -> Mapping[str | None, float]:
         """Return the measurable offsets, s; positive if the clock is ahead.
 
         Delays of sources that are silent at `now`, Unix s, are deleted.
         """
-        for source in [each for each, last in self._arrived.items() if now - last > self._silence]:
-            del self._arrived[source]
-            self._delays[source].clear()
-        middle = {source: median(delays) for source, delays in self._delays.items() if len(delays) >= FEWEST}
-        if len(middle) < SOURCES:
-            self._reported.clear()
+        gone = now - self._arrived > self._silence
+        if gone.any():
+            self._delete(gone)
+        enough = np.flatnonzero(self._count >= FEWEST)
+        if enough.size < SOURCES:
+            self._reported[:] = False
             return {}
-        fleet = median(middle.values())
-        least = KEEPS * self._least
+        middle = _medians(self._delays[:, enough], self._count[enough])
+        off = float(np.median(middle)) - middle
+        # Half of `least` is the lower bound of all limits and is cheaper.
+        maybe = np.flatnonzero(np.abs(off) >= KEEPS * self._least)
         found = {
-            source: fleet - one
-            for source, one in middle.items()
-            # `least` is the lower bound of all limits and is cheaper.
-            if abs(fleet - one) >= least and abs(fleet - one) >= self._limit(source, one)
+            int(enough[k]): float(off[k])
+            for k in maybe
+            if abs(off[k]) >= self._limit(int(enough[k]), float(middle[k]))
         }
-        self._reported = set(found)
-        return found
+        self._reported[:] = False
+        self._reported[list(found)] = True
+        return {self._sources[k]: offset for k, offset in found.items()}
 
-    def _limit(self, source: str | None, middle: float) -> float:
+    def _limit(self, source: int, middle: float) -> float:
         """Smallest reported offset of a source, s."""
-        delays = self._delays[source]
-        spread = _NORMAL * median(abs(delay - middle) for delay in delays)
-        limit = max(self._least, SURE * _MEDIAN * spread / math.sqrt(len(delays)))
-        return KEEPS * limit if source in self._reported else limit
+        delays = self._delays[:, source]
+        delays = delays[np.isfinite(delays)]
+        spread = _NORMAL * float(np.median(np.abs(delays - middle)))
+        limit = max(self._least, SURE * _MEDIAN * spread / math.sqrt(delays.size))
+        return KEEPS * limit if self._reported[source] else limit
+
+
+def _medians(columns: Floats, count: Ints) -> Floats:
+    """Median of the `count` finite numbers of each column; all others are infinite."""
+    ordered = np.sort(columns, axis=0)
+    each = np.arange(count.size)
+    return np.asarray((ordered[(count - 1) // 2, each] + ordered[count // 2, each]) / 2.0)
+
+
+def _rank(grouped: Ints) -> Ints:
+    """Position of each element among the equal ones before it; equal elements are side by side."""
+    again = grouped[1:] == grouped[:-1]
+    if not again.any():
+        return np.zeros(grouped.size, dtype=np.intp)
+    each = np.arange(grouped.size)
+    begins = np.concatenate(([True], ~again))
+    return each - np.maximum.accumulate(np.where(begins, each, 0))
 
 
 HELD_PER_SOURCE = 512
@@ -217,14 +269,14 @@ def rules(
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Tick:
-    """Readings that belong to one tick."""
+    """Readings that belong to one tick. p meters."""
 
     t: float  # Unix time, s
-    # The usable reading of each meter, in the order of the feeder's meters; None if unavailable.
-    readings: tuple[Reading | None, ...]
-    busbar: Reading | None  # the usable reading of the busbar meter, or None
+    # (5, p + 1): rows as in `Readings.values`: usable reading of each meter, and last of the busbar meter;
+    # NaN if unavailable.
+    values: Floats
     # Silent sources as (meter, seconds since the last usable reading); None is the busbar meter, infinity a
     # source without any usable reading.
     silent: tuple[tuple[str | None, float], ...]
@@ -232,20 +284,33 @@ class Tick:
     # (p,) or (): Lead of each meter's clock, s; None if not measurable, () if none is.
     clock_offset: tuple[float | None, ...] = ()
     busbar_offset: float | None = None  # lead of the busbar meter's clock, s; None if not measurable
+    v_phases: tuple[float, ...] | None = None  # voltages of the busbar's phases, V, as in `Reading`
+
+    @property
+    def seen(self) -> Bools:
+        """Meters with a usable reading, (p,)."""
+        return np.asarray(np.isfinite(self.values[V_VOLT, :-1]))
+
+    @property
+    def busbar_volt(self) -> float:
+        """Voltage of the busbar meter's usable reading, V; NaN if unavailable."""
+        return float(self.values[V_VOLT, -1])
 
 
-@dataclass(slots=True)
-class _Source:
-    held: list[Reading] = field(default_factory=list)
-    last_t: float = -math.inf
-    last_heard: float = -math.inf
-    last_used: float = -math.inf
-    heard: int = 0
-    seq: int | None = None
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """Result of the alignment of several readings."""
+
+    counts: Mapping[ReadingOutcome, int]  # readings by outcome
+    clock_off: tuple[int, ...]  # positions of those with a wrong clock
+    ticks: list[Tick]  # ticks that became due, in order
 
 
-def _time_of(reading: Reading) -> float:
-    return reading.t
+SLOTS = 4
+"""Readings of each source that the table holds at first; it grows to `HELD_PER_SOURCE`."""
+
+ALONE = 8
+"""Readings placed one by one after a shorter run: the fixed cost of a run is that of about as many."""
 
 
 class Aligner:
@@ -264,8 +329,17 @@ class Aligner:
         self.lost = 0
         self.restarts = 0
         self._skipped = 0
-        self._sources: dict[str | None, _Source] = {meter: _Source() for meter in (*self.meters, None)}
-        self._waiting: set[str | None] = set()
+        size = len(self.meters) + 1
+        self._index: dict[str | None, int] = {source: k for k, source in enumerate((*self.meters, None))}
+        self._each = np.arange(size)
+        # (5, slots, p + 1): held readings of each source by time; the time of an empty slot is infinite.
+        self._held = _empty(SLOTS, size)
+        self._phases: dict[float, tuple[float, ...]] = {}
+        self._count = np.zeros(size, dtype=np.intp)
+        self._last_t, self._last_heard, self._last_used = np.full((3, size), -np.inf)
+        self._seq = np.full(size, NO_SEQ, dtype=np.int64)
+        self._waiting = np.zeros(size, dtype=np.bool_)
+        self._waits = 0
         self._next: int | None = None
         self._first: int | None = None
         self._resumed = -math.inf
@@ -273,7 +347,8 @@ class Aligner:
         self._now: float | None = None
         self._latest = -math.inf
         self._arrivals = 0
-        self._active: OrderedDict[str | None, float] = OrderedDict()
+        self._heard = [0] * size
+        self._active: OrderedDict[int, float] = OrderedDict()
         self._claims: list[float] = []
         self._clocks = ClockOffsets((*self.meters, None), rules.tick_s, rules.silence_s)
         self._offsets: tuple[float | None, ...] = ()
@@ -288,67 +363,252 @@ class Aligner:
 
         Returns outcome, ticks: result for the reading; the ticks, in order.
         """
+        values = (reading.t, reading.v_volt, reading.p_kw, reading.q_kvar, reading.t_power)
+        seq = NO_SEQ if reading.seq is None else reading.seq
+        return self._take(self._index[reading.meter], values, seq, reading.v_phases, now)
+
+    def take_all(self, readings: Readings) -> Placed:
+        """Align readings as `take` does one after the other."""
+        size, begin = len(readings), 0
+        ticks: list[Tick] = []
+        before, refused, clock_off = self.counts.copy(), len(self._refused), list[int]()
+        latest = np.maximum(np.maximum.accumulate(readings.arrival), self._latest)
+        while begin < size:
+            end = begin
+            if self.rules.clock is Clock.WALL:
+                self._latest = float(latest[begin])
+                ticks.extend(self._emit_ticks(self._latest))
+                end = self._run(readings, latest, begin)
+            if end - begin >= ALONE:
+                self._latest = float(latest[end - 1])
+                ticks.extend(self._emit_ticks(self._latest))
+                begin = end
+                continue
+            for k in range(begin, min(begin + ALONE, size)):
+                outcome, more = self._take(*readings.row(k), float(readings.arrival[k]))
+                ticks.extend(more)
+                if outcome is ReadingOutcome.CLOCK_OFF:
+                    clock_off.append(k)
+            begin = min(begin + ALONE, size)
+        return Placed(self._counted(before, len(self._refused) - refused), tuple(clock_off), ticks)
+
+    def _counted(self, before: Counter[ReadingOutcome], refused: int) -> dict[ReadingOutcome, int]:
+        """Readings by outcome since `before`, each as at its arrival; `refused` were accepted then."""
+        corrected = {ReadingOutcome.ACCEPTED: refused, ReadingOutcome.CLOCK_OFF: -refused}
+        counts = {one: self.counts[one] - before[one] + corrected.get(one, 0) for one in ReadingOutcome}
+        return {outcome: count for outcome, count in counts.items() if count}
+
+    def _take(
+        self,
+        source: int,
+        values: tuple[float, ...],
+        seq: int,
+        phases: tuple[float, ...] | None,
+        now: float,
+    ) -> tuple[ReadingOutcome, list[Tick]]:
         # A reading that waited in the queue arrived before the present time; the clock was not set back.
         self._latest = max(self._latest, now)
         ticks = list(self._emit_ticks(self._latest))
-        source = self._sources[reading.meter]
         if self.rules.clock is Clock.EVENTS:
-            self._hear(reading, source)
+            self._hear(values[T], source)
             ticks.extend(self._emit_ticks(self._latest))
-        outcome = self._place(reading, source, self.now(now))
+        outcome = self._place(source, values, seq, phases, self.now(now))
         self.counts[outcome] += 1
         ticks.extend(self._emit_ticks(self._latest))
         return outcome, ticks
 
     def refused(self) -> tuple[Reading, ...]:
-        """Return, once, the readings that were accepted before the time was known and have a wrong clock."""
+        """Return, once, the readings that were accepted before the time was known and have a wrong clock.
+
+        Feeder and sequence number are left out.
+        """
         refused, self._refused = tuple(self._refused), []
         return refused
 
-    def _place(self, reading: Reading, source: _Source, now: float | None) -> ReadingOutcome:
-        t = reading.t
+    def _name(self, source: int) -> str | None:
+        return self.meters[source] if source < len(self.meters) else None
+
+    def _run(self, readings: Readings, latest: Floats, begin: int) -> int:
+        """Place the run of readings from `begin` that are in order and before the next tick; return its end.
+
+        In a run each reading of a source is later than the one before it, or repeats it.
+
+        latest (n,): newest arrival up to each reading, Unix s. Nothing is placed if the run is shorter than
+        `ALONE`.
+        """
+        rules, number = self.rules, self._number()
+        latest = latest[begin:]
+        # From the end of the grace, and from where the backlog ends, a tick may come before a reading.
+        limit = min(self._time(number) + rules.grace_s, self._time(number + rules.backlog))
+        end = max(1, int(latest.searchsorted(limit)))
+        source, arrival = readings.source[begin : begin + end], readings.arrival[begin : begin + end]
+        t = readings.values[T, begin : begin + end]
+        order = source.argsort(kind="stable")
+        by_source, by_t = source[order], t[order]
+        repeated = by_source[1:] == by_source[:-1]
+        before, room = self._last_t[by_source], HELD_PER_SOURCE - self._count[by_source]
+        if repeated.any():
+            before[1:][repeated] = by_t[:-1][repeated]
+            room -= _rank(by_source)
+        plain, fresh = np.empty((2, end), dtype=np.bool_)
+        fresh[order] = by_t > before
+        plain[order] = (by_t >= before) & (room > 0)
+        late = t <= self._time(number - 1) + rules.lead_s
+        plain &= np.abs(t - arrival) <= rules.max_skew_s
+        if late.any():
+            # A late reading of a source that is not waited for may be the end of its silence. An old one of a
+            # source without any other may show its silence.
+            silent = self._time(number) - np.minimum(t, arrival) > rules.silence_s
+            plain &= ~(late & fresh & (silent | ~self._waiting[source]))
+        if not plain.all():
+            end = int(plain.argmin())
+        # The tick comes with the reading of the last source that it waits for, once its time is reached.
+        reached = int(latest[:end].searchsorted(self._time(number)))
+        if reached < end:
+            last = self._last_waiting(source[:end], fresh[:end] & ~late[:end])
+            end = min(end, max(last + 1, reached))
+        if end < ALONE:
+            return begin
+        chosen = order[(order < end) & fresh[order]]
+        self.counts[ReadingOutcome.DUPLICATE] += end - chosen.size
+        if chosen.size:
+            self._place_run(readings, begin + chosen, late[chosen])
+        return begin + end
+
+    def _last_waiting(self, source: Ints, reports: Bools) -> int:
+        """Position of the reading after which no source is waited for; the size if some still are.
+
+        reports (n,): readings that count for the next tick.
+        """
+        if not self._waits:
+            return -1
+        first = np.full(self._waiting.size, source.size)
+        at = np.flatnonzero(reports)[::-1]
+        # Of equal indices the last assignment counts.
+        first[source[at]] = at
+        return int(first[self._waiting].max())
+
+    def _place_run(self, readings: Readings, at: Ints, late: Bools) -> None:
+        """Place readings of a run, grouped by source; `late` are those that the last tick has missed."""
+        source, arrival, values = readings.source[at], readings.arrival[at], readings.values[:, at]
+        slot = self._count[source] + _rank(source)
+        self._clocks.note_all(source, values[T], arrival)
+        self._count_gaps(source, readings.seq[at])
+        if (most := int(slot.max())) >= self._held.shape[1]:
+            self._grow(most + 1)
+        self._held[:, slot, source] = values
+        # Of equal indices the last assignment counts.
+        self._count[source] = slot + 1
+        self._last_t[source] = values[T]
+        self._last_heard[source] = arrival
+        if readings.v_phases is not None:
+            for k in np.flatnonzero(source == len(self.meters)):
+                self._keep_phases(float(values[T, k]), readings.phases_of(int(at[k])))
+        missed = int(np.count_nonzero(late))
+        self.counts[ReadingOutcome.LATE] += missed
+        self.counts[ReadingOutcome.ACCEPTED] += source.size - missed
+        self._waiting[source[~late] if missed else source] = False
+        self._waits = int(np.count_nonzero(self._waiting))
+
+    def _keep_phases(self, t: float, phases: tuple[float, ...] | None) -> None:
+        if phases is not None:
+            self._phases[t] = phases
+
+    def _place(
+        self,
+        source: int,
+        values: tuple[float, ...],
+        seq: int,
+        phases: tuple[float, ...] | None,
+        now: float | None,
+    ) -> ReadingOutcome:
+        t, last_t = values[T], float(self._last_t[source])
         if now is not None and abs(t - now) > self.rules.max_skew_s:
             return ReadingOutcome.CLOCK_OFF
-        index = bisect_left(source.held, t, key=_time_of)
-        if index < len(source.held) and source.held[index].t == t:
+        index, count = self._before(source, t), int(self._count[source])
+        if index < count and self._held[T, index, source] == t:
             return ReadingOutcome.DUPLICATE
         if now is not None and self.rules.clock is Clock.WALL:
-            self._clocks.note(reading.meter, t, now)
-        self._count_gap(reading, source)
+            self._clocks.note_all(np.array([source]), np.array([t]), np.array([now]))
+        self._count_gap(source, seq, t)
         late = self._next is not None and t <= self._time(self._next - 1) + self.rules.lead_s
-        if late and t <= source.last_t:
+        if late and t <= last_t:
             return ReadingOutcome.LATE
-        if len(source.held) >= HELD_PER_SOURCE:
+        if count >= HELD_PER_SOURCE:
             self._thin(source)
-            if len(source.held) >= HELD_PER_SOURCE:
+            count = int(self._count[source])
+            if count >= HELD_PER_SOURCE:
                 return ReadingOutcome.OVERFLOW
-            index = bisect_left(source.held, t, key=_time_of)
-        source.held.insert(index, reading)
-        in_order = t > source.last_t
-        source.last_t = max(source.last_t, t)
+            index = self._before(source, t)
+        if count >= self._held.shape[1]:
+            self._grow(count + 1)
+        self._held[:, index + 1 : count + 1, source] = self._held[:, index:count, source]
+        self._held[:, index, source] = values
+        self._count[source] = count + 1
+        if source == len(self.meters):
+            self._keep_phases(t, phases)
+        in_order = t > last_t
+        self._last_t[source] = max(last_t, t)
         # A time stamp in the future does not prove that the meter still reports then.
-        source.last_heard = t if now is None or self.rules.clock is Clock.EVENTS else now
+        self._last_heard[source] = t if now is None or self.rules.clock is Clock.EVENTS else now
         if self._next is not None:
-            self._wait_for(reading.meter, source, self._next)
+            self._wait_for(source, self._next)
         if late:
             return ReadingOutcome.LATE
         return ReadingOutcome.ACCEPTED if in_order else ReadingOutcome.OUT_OF_ORDER
 
-    def _thin(self, source: _Source) -> None:
-        """Keep only the last reading between two ticks: no tick uses the others."""
-        numbers = [self._serves(held) for held in source.held]
-        pairs = zip(source.held, numbers, [*numbers[1:], None], strict=True)
-        source.held = [held for held, number, after in pairs if number != after]
+    def _before(self, source: int, t: float) -> int:
+        """Number of held readings of a source before a time."""
+        return int(np.searchsorted(self._held[T, : self._count[source], source], t))
 
-    def _count_gap(self, reading: Reading, source: _Source) -> None:
+    def _grow(self, least: int) -> None:
+        """Extend the table to at least `least` slots."""
+        slots = min(HELD_PER_SOURCE, max(least, 2 * self._held.shape[1]))
+        held, self._held = self._held, _empty(slots, self._count.size)
+        self._held[:, : held.shape[1]] = held
+
+    def _thin(self, source: int) -> None:
+        """Keep only the last reading between two ticks: no tick uses the others."""
+        numbers = [self._serves(t) for t in self._times(source)]
+        self._keep(
+            source, [k for k, (one, after) in enumerate(zip_longest(numbers, numbers[1:])) if one != after]
+        )
+
+    def _keep(self, source: int, which: list[int]) -> None:
+        """Keep only some held readings of a source, by position."""
+        kept = self._held[:, which, source]
+        self._held[:, :, source] = np.nan
+        self._held[T, :, source] = np.inf
+        self._held[:, : len(which), source] = kept
+        self._count[source] = len(which)
+        self._drop_phases()
+
+    def _times(self, source: int) -> list[float]:
+        """Times of the held readings of a source, s."""
+        times: list[float] = self._held[T, : self._count[source], source].tolist()
+        return times
+
+    def _count_gap(self, source: int, seq: int, t: float) -> None:
         # A decreasing number is a restart or a changed order, not a loss. The ring of the subscription drops
         # the oldest samples, which only this gap shows. A reading overtaken by a later one is not evidence of
         # a loss.
-        if reading.seq is None or reading.t < source.last_t:
+        if seq == NO_SEQ or t < self._last_t[source]:
             return
-        if source.seq is not None and 0 < (gap := reading.seq - source.seq - 1) <= GAP_MAX:
+        before = int(self._seq[source])
+        if before != NO_SEQ and 0 < (gap := seq - before - 1) <= GAP_MAX:
             self.lost += gap
-        source.seq = reading.seq
+        self._seq[source] = seq
+
+    def _count_gaps(self, source: Ints, seq: Ints) -> None:
+        """Count the lost readings before readings in order, grouped by source."""
+        numbered = seq != NO_SEQ
+        if not numbered.any():
+            return
+        source, seq = source[numbered], seq[numbered]
+        before = np.where(_rank(source) > 0, np.concatenate(([NO_SEQ], seq[:-1])), self._seq[source])
+        gap = seq - before - 1
+        self.lost += int(gap[(before != NO_SEQ) & (gap > 0) & (gap <= GAP_MAX)].sum())
+        self._seq[source] = seq
 
     # ---------------------------------------------------------------- time
 
@@ -363,25 +623,25 @@ class Aligner:
         """Return the latest wall time of the next tick of `due`, s; None if only readings can cause one."""
         if self.rules.clock is Clock.EVENTS or self._next is None:
             return None
-        return self._time(self._next) + (self.rules.grace_s if self._waiting else 0.0)
+        return self._time(self._next) + (self.rules.grace_s if self._waits else 0.0)
 
-    def _hear(self, reading: Reading, source: _Source) -> None:
-        """Update the time from a reading."""
+    def _hear(self, t: float, source: int) -> None:
+        """Update the time from the time of a reading, s."""
         # The count leaves out clocks far ahead: frequent readings of such a clock must not expire the other
         # sources.
-        if self._now is None or reading.t - self._now <= self.rules.max_skew_s:
+        if self._now is None or t - self._now <= self.rules.max_skew_s:
             self._arrivals += 1
-        meter = reading.meter
-        if meter in self._active:
-            self._claims.pop(bisect_left(self._claims, self._active.pop(meter)))
-        source.heard = self._arrivals
-        self._active[meter] = reading.t
-        insort(self._claims, reading.t)
-        window = max(_ACTIVE_ROUNDS * len(self._sources), 64)
-        while self._sources[next(iter(self._active))].heard <= self._arrivals - window:
+        if source in self._active:
+            self._claims.pop(bisect_left(self._claims, self._active.pop(source)))
+        self._heard[source] = self._arrivals
+        self._active[source] = t
+        insort(self._claims, t)
+        sources = len(self._heard)
+        window = max(_ACTIVE_ROUNDS * sources, 64)
+        while self._heard[next(iter(self._active))] <= self._arrivals - window:
             _, claim = self._active.popitem(last=False)
             self._claims.pop(bisect_left(self._claims, claim))
-        if self._now is None and 2 * len(self._active) < len(self._sources) and self._arrivals < window:
+        if self._now is None and 2 * len(self._active) < sources and self._arrivals < window:
             return
         count = len(self._claims)
         reached = self._claims[count - (count + 1) // 2]
@@ -393,14 +653,21 @@ class Aligner:
 
     def _sweep(self, now: float) -> None:
         """Remove the readings that were accepted before the time was known and do not fit it."""
-        for source in self._sources.values():
-            wild = [r for r in source.held if abs(r.t - now) > self.rules.max_skew_s]
-            if wild:
-                self._refused.extend(wild)
-                self.counts[ReadingOutcome.ACCEPTED] -= len(wild)
-                self.counts[ReadingOutcome.CLOCK_OFF] += len(wild)
-                source.held = [r for r in source.held if abs(r.t - now) <= self.rules.max_skew_s]
-                source.last_t = source.held[-1].t if source.held else -math.inf
+        for source in range(self._count.size):
+            times = self._times(source)
+            fits = [k for k, t in enumerate(times) if abs(t - now) <= self.rules.max_skew_s]
+            if len(fits) == len(times):
+                continue
+            for k in sorted({*range(len(times))} - {*fits}):
+                t, v_volt, p_kw, q_kvar, t_power = self._held[:, k, source].tolist()
+                phases = self._phases.get(t) if source == len(self.meters) else None
+                self._refused.append(
+                    Reading("", self._name(source), t, v_volt, p_kw, q_kvar, None, phases, t_power)
+                )
+            self.counts[ReadingOutcome.ACCEPTED] -= len(times) - len(fits)
+            self.counts[ReadingOutcome.CLOCK_OFF] += len(times) - len(fits)
+            self._keep(source, fits)
+            self._last_t[source] = times[fits[-1]] if fits else -math.inf
 
     def _time(self, number: int) -> float:
         return number * self.rules.tick_s
@@ -416,9 +683,11 @@ class Aligner:
             # The clock was set back: without a restart there would be no tick until it reaches its previous
             # time.
             self.restarts += 1
-            for source in self._sources.values():
-                source.held.clear()
-                source.last_t = source.last_heard = source.last_used = -math.inf
+            self._held = _empty(SLOTS, self._count.size)
+            self._phases.clear()
+            self._count[:] = 0
+            for times in (self._last_t, self._last_heard, self._last_used):
+                times[:] = -math.inf
             self._clocks.forget()
             self._offsets, self._busbar_offset = (), None
             self._latest = wall
@@ -440,11 +709,17 @@ class Aligner:
             self._resumed = self._time(self._number())
         while True:
             t = self._time(self._number())
-            if now < t or (self._waiting and now < t + self.rules.grace_s):
+            if now < t or (self._waits and now < t + self.rules.grace_s):
                 return
             tick = self._tick(t)
             self._turn_to(self._number() + 1)
             yield tick
+
+    def excuse(self) -> None:
+        """Count no time until now as silence: the readings were discarded."""
+        if self._next is not None:
+            self._resumed = self._time(self._next)
+            self._turn_to(self._next)
 
     def flush(self) -> Iterator[Tick]:
         """Emit every tick that the time has reached, without grace: the input has ended."""
@@ -463,25 +738,26 @@ class Aligner:
     def _resume(self, now: int) -> int:
         """Number of the first tick to form after a step of the time to tick number `now`."""
         first = now - self.rules.backlog
-        newest = [source.held[-1] for source in self._sources.values() if source.held]
-        starts = ((max(first, self._serves(reading)), reading.t) for reading in newest)
+        newest = [times[-1] for source in range(self._count.size) if (times := self._times(source))]
+        starts = ((max(first, self._serves(t)), t) for t in newest)
         serving = any(n < now and self._time(n) - t < self.rules.max_age_s for n, t in starts)
         return first if serving or not self.rules.skips_empty else now
 
     def _skip(self, first: int, following: int) -> None:
         """Continue with the tick `following`; readings serve as if the skipped ticks had been formed."""
-        for source in self._sources.values():
-            for reading, later in zip_longest(source.held, source.held[1:]):
-                begin = max(first, self._serves(reading))
+        for source in range(self._count.size):
+            times = self._times(source)
+            for t, later in zip_longest(times, times[1:]):
+                begin = max(first, self._serves(t))
                 end = following if later is None else min(following, self._serves(later))
-                if begin < end and self._time(begin) - reading.t < self.rules.max_age_s:
-                    source.last_used = max(source.last_used, reading.t)
+                if begin < end and self._time(begin) - t < self.rules.max_age_s:
+                    self._last_used[source] = max(float(self._last_used[source]), t)
         self._skipped += following - first
         self._turn_to(following)
 
-    def _serves(self, reading: Reading) -> int:
-        """Return the number of the first tick that may use a reading."""
-        return math.ceil((reading.t - self.rules.lead_s) / self.rules.tick_s)
+    def _serves(self, t: float) -> int:
+        """Return the number of the first tick that may use a reading of a time, s."""
+        return math.ceil((t - self.rules.lead_s) / self.rules.tick_s)
 
     def _begin(self, now: float) -> None:
         self._first = math.ceil(now / self.rules.tick_s)
@@ -497,56 +773,82 @@ class Aligner:
     def _turn_to(self, number: int) -> None:
         self._next = number
         before = self._time(number - 1) + self.rules.lead_s
-        self._waiting.clear()
-        for meter, source in self._sources.items():
-            # The newest reading at or before the last tick may serve the next one; older ones never will.
-            done = bisect_left(source.held, math.nextafter(before, math.inf), key=_time_of)
-            if done > 1:
-                del source.held[: done - 1]
-            self._wait_for(meter, source, number)
-
-    def _wait_for(self, meter: str | None, source: _Source, number: int) -> None:
-        """Wait for a source at a tick if it is not silent and has not reported for it."""
-        reported = source.last_t > self._time(number - 1) + self.rules.lead_s
+        # The newest reading at or before the last tick may serve the next one; older ones never will.
+        done = np.maximum((self._held[T] <= before).sum(axis=0) - 1, 0)
+        if done.any():
+            self._drop(done)
+        reported = self._last_t > before
         # Independent of usability: with long ticks the last source would otherwise be late at every tick, and
         # silent.
-        if reported or self._silent_for(source, source.last_t, self._time(number)):
-            self._waiting.discard(meter)
-        else:
-            self._waiting.add(meter)
+        self._waiting = ~(reported | (self._silent_for(self._last_t, self._time(number)) > 0.0))
+        self._waits = int(np.count_nonzero(self._waiting))
 
-    def _silent_for(self, source: _Source, last: float, t: float) -> float:
-        """Return the duration of a source's silence at t since `last`, s; 0 if it is not silent."""
-        if t - self._resumed <= self.rules.silence_s:
-            return 0.0
-        since = min(last, source.last_heard)
-        if since == -math.inf and self._first is not None:
-            since = self._time(self._first)
-            return math.inf if t - since > self.rules.silence_s else 0.0
-        return t - since if t - since > self.rules.silence_s else 0.0
+    def _drop(self, done: Ints) -> None:
+        """Drop the oldest held readings of each source, by number."""
+        kept = self._count - done
+        slots = max(SLOTS, int(kept.max()))
+        old = self._held
+        held = _empty(slots, self._count.size)
+        if (done == done[0]).all():
+            left = min(slots, old.shape[1] - int(done[0]))
+            held[:, :left] = old[:, int(done[0]) : int(done[0]) + left]
+        else:
+            there = np.minimum(np.arange(slots)[:, None] + done, old.shape[1] - 1)
+            filled = np.arange(slots)[:, None] < kept
+            moved = np.take_along_axis(old, np.broadcast_to(there, (COLUMNS, *there.shape)), axis=1)
+            np.copyto(held, moved, where=filled)
+        self._held, self._count = held, kept
+        self._drop_phases()
+
+    def _drop_phases(self) -> None:
+        """Drop the phases of readings of the busbar that are not held any more."""
+        if self._phases:
+            times = set(self._times(len(self.meters)))
+            self._phases = {t: phases for t, phases in self._phases.items() if t in times}
+
+    def _wait_for(self, source: int, number: int) -> None:
+        """Wait for a source at a tick if it is not silent and has not reported for it."""
+        last_t = self._last_t[source : source + 1]
+        wait = not last_t[0] > self._time(number - 1) + self.rules.lead_s
+        if wait:
+            heard = self._last_heard[source : source + 1]
+            wait = not self._silent_for(last_t, self._time(number), heard)[0] > 0.0
+        self._waits += int(wait) - int(self._waiting[source])
+        self._waiting[source] = wait
+
+    def _silent_for(self, last: Floats, t: float, heard: Floats | None = None) -> Floats:
+        """Return the duration of each source's silence at t since `last`, s; 0 if it is not silent.
+
+        `heard` are the latest arrivals of these sources, s; None for all sources.
+        """
+        silence_s = self.rules.silence_s
+        if t - self._resumed <= silence_s:
+            return np.zeros(last.size)
+        since = t - np.minimum(last, self._last_heard if heard is None else heard)
+        if self._first is not None and t - self._time(self._first) <= silence_s:
+            since[since == math.inf] = 0.0
+        return np.where(since > silence_s, since, 0.0)
 
     def _tick(self, t: float) -> Tick:
-        seen = {meter: self._usable(source, t) for meter, source in self._sources.items()}
-        for meter, reading in seen.items():
-            if reading is not None:
-                self._sources[meter].last_used = reading.t
-        silent = tuple(
-            (meter, seconds)
-            for meter, source in self._sources.items()
-            if (seconds := self._silent_for(source, source.last_used, t)) > 0.0
-        )
+        index = (self._held[T] <= t + self.rules.lead_s).sum(axis=0) - 1
+        values = self._held[:, np.maximum(index, 0), self._each]
+        usable = (index >= 0) & (t - values[T] < self.rules.max_age_s)
+        np.copyto(self._last_used, values[T], where=usable)
+        values[:, ~usable] = np.nan
+        seconds = self._silent_for(self._last_used, t)
+        silent = tuple((self._name(int(k)), float(seconds[k])) for k in np.flatnonzero(seconds))
         skipped, self._skipped = self._skipped, 0
         if self._number() % OFFSETS_TICKS == 0:
             found = self._clocks.measured(t)
             self._busbar_offset = found.get(None)
             offsets = tuple(found.get(meter) for meter in self.meters)
             self._offsets = offsets if any(offsets) else ()
-        readings = tuple(seen[meter] for meter in self.meters)
-        return Tick(t, readings, seen[None], silent, skipped, self._offsets, self._busbar_offset)
+        phases = self._phases.get(float(values[T, -1])) if self._phases else None
+        return Tick(t, values, silent, skipped, self._offsets, self._busbar_offset, phases)
 
-    def _usable(self, source: _Source, t: float) -> Reading | None:
-        index = bisect_left(source.held, math.nextafter(t + self.rules.lead_s, math.inf), key=_time_of)
-        if index == 0:
-            return None
-        reading = source.held[index - 1]
-        return reading if t - reading.t < self.rules.max_age_s else None
+
+def _empty(slots: int, sources: int) -> Floats:
+    """Table of held readings without any, (5, slots, sources)."""
+    held = np.full((COLUMNS, slots, sources), np.nan)
+    held[T] = np.inf
+    return held

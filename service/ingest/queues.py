@@ -5,9 +5,9 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -40,19 +40,17 @@ class BusConfig:
     accept_pending: int = 1_000
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """One put, copied from zenoh: key, bytes, encoding, wall time of its arrival (Unix s), attachment.
+class Sample(NamedTuple):
+    """One put, copied from zenoh.
 
-    A payload above the limit is cut to its beginning; `size` is the whole length. An oversized key is cut,
-    too.
+    A payload above the limit is cut to its beginning. An oversized key is cut, too.
     """
 
     key: str
     payload: bytes
     encoding: str
-    arrival: float
-    size: int
+    arrival: float  # wall time of its arrival, Unix s
+    size: int  # length of the whole payload, bytes
     attachment: bytes = b""
 
 
@@ -69,13 +67,55 @@ class BusCounts:
 _OVERHEAD = 256
 
 
+LANE_SAMPLES = 1024
+"""Samples of one feeder in one round; a flood of one feeder delays the others by no more."""
+
+THINNED_FROM = 512
+"""Length of a feeder's queue from which its keys are thinned to equal numbers."""
+
+THINNED = 8
+"""Divisor of the largest number of samples of a key that are dropped at once."""
+
+
+@dataclass(slots=True)
+class _Lane:
+    """Queue of one feeder."""
+
+    waiting: deque[Sample] = field(default_factory=deque)
+    bytes: int = 0  # memory of the waiting samples
+    offered: int = 0  # number of all samples so far
+
+    def drop(self) -> int:
+        """Drop the oldest sample, or the oldest ones of the keys with the most; return their number."""
+        counts = Counter(sample.key for sample in self.waiting) if len(self.waiting) > THINNED_FROM else {}
+        most = max(counts.values(), default=1)
+        if most == 1:
+            self.bytes -= _size(self.waiting.popleft())
+            return 1
+        left = most - max(1, most // THINNED)
+        kept: deque[Sample] = deque()
+        for sample in self.waiting:
+            if counts[sample.key] > left:
+                counts[sample.key] -= 1
+                self.bytes -= _size(sample)
+            else:
+                kept.append(sample)
+        dropped, self.waiting = len(self.waiting) - len(kept), kept
+        return dropped
+
+
 class Inbox:
     """Queue of samples before the runtime, bounded in number and bytes.
 
+    Each feeder has a queue of its own. When full, the largest one drops the oldest samples of the keys with
+    the most: a flood displaces its own samples first.
+
+    wake: called from the sender's thread after samples have been added.
     max_samples, max_bytes: the bounds.
     lossless: when full, block the sender instead of dropping the oldest sample. For `Clock.EVENTS`, where no
-        sample gets stale; with the wall clock the oldest samples are worthless.
-    wake: called from the sender's thread after samples have been added.
+        sample gets stale; with the wall clock the oldest samples are worthless. There is one queue then.
+    feeder_of: feeder of a key; None for a key without a monitored feeder.
+    shed: feeders with samples that are counted and discarded.
     """
 
     def __init__(
@@ -85,52 +125,94 @@ class Inbox:
         max_samples: int = 20_000,
         max_bytes: int = 64 << 20,
         lossless: bool,
+        feeder_of: Callable[[str], str | None] = lambda _: None,
     ) -> None:
+        self.shed: frozenset[str] = frozenset()
         self._wake = wake
         self._max_samples = max_samples
         self._max_bytes = max_bytes
         self._lossless = lossless
-        self._waiting: deque[Sample] = deque()
+        self._feeder_of = feeder_of
+        self._lanes: dict[str | None, _Lane] = {}
+        self._length = 0
         self._bytes = 0
         self._closed = False
         self._room = threading.Condition()
 
     def __len__(self) -> int:
         """Number of waiting samples."""
-        return len(self._waiting)
+        return self._length
 
-    def oldest(self) -> float | None:
-        """Return the arrival time of the oldest waiting sample, Unix s; None if the queue is empty."""
+    def oldest(self) -> dict[str, float]:
+        """Return the arrival time of the oldest waiting sample of each feeder, Unix s."""
         with self._room:
-            return self._waiting[0].arrival if self._waiting else None
+            each = self._lanes.items()
+            return {name: lane.waiting[0].arrival for name, lane in each if name is not None and lane.waiting}
+
+    def offered(self) -> dict[str, int]:
+        """Return the number of samples of each feeder so far, discarded ones included."""
+        with self._room:
+            return {name: lane.offered for name, lane in self._lanes.items() if name is not None}
 
     def put(self, batch: list[Sample]) -> int:
         """Add samples; called from any thread. Returns the number of dropped samples."""
         dropped = 0
-        for sample in batch:
-            size = _size(sample)
-            with self._room:
-                while self._lossless and not self._closed and self._waiting and self._full(size):
+        with self._room:
+            for sample in batch:
+                size = _size(sample)
+                while self._lossless and not self._closed and self._length and self._full(size):
                     self._wake()
                     self._room.wait(timeout=1.0)
                 if self._closed:
                     return dropped
-                self._waiting.append(sample)
+                name = None if self._lossless else self._feeder_of(sample.key)
+                lane = self._lanes.get(name)
+                if lane is None:
+                    lane = self._lanes[name] = _Lane()
+                lane.offered += 1
+                if name in self.shed:
+                    continue
+                lane.waiting.append(sample)
+                lane.bytes += size
+                self._length += 1
                 self._bytes += size
-                while len(self._waiting) > 1 and self._full(0):
-                    self._bytes -= _size(self._waiting.popleft())
-                    dropped += 1
+                while self._length > 1 and self._full(0):
+                    dropped += self._drop()
         self._wake()
         return dropped
 
+    def _drop(self) -> int:
+        """Drop samples of the largest queue."""
+        lane = max(self._lanes.values(), key=lambda one: one.bytes)
+        before = lane.bytes
+        dropped = lane.drop()
+        self._bytes -= before - lane.bytes
+        self._length -= dropped
+        return dropped
+
     def drain(self, limit: int) -> list[Sample]:
-        """Remove and return up to `limit` samples, oldest first."""
+        """Remove and return up to `limit` samples, and `LANE_SAMPLES` of a feeder, oldest first in each."""
+        taken: list[Sample] = []
         with self._room:
-            count = min(limit, len(self._waiting))
-            taken = [self._waiting.popleft() for _ in range(count)]
-            self._bytes -= sum(map(_size, taken))
+            for lane in self._lanes.values():
+                count = min(limit - len(taken), len(lane.waiting), limit if self._lossless else LANE_SAMPLES)
+                some = [lane.waiting.popleft() for _ in range(count)]
+                size = sum(map(_size, some))
+                lane.bytes -= size
+                self._bytes -= size
+                taken += some
+            self._length -= len(taken)
             self._room.notify_all()
         return taken
+
+    def forget(self, feeder: str) -> None:
+        """Discard the waiting samples of a feeder."""
+        with self._room:
+            lane = self._lanes.pop(feeder, None)
+            if lane is not None:
+                self._length -= len(lane.waiting)
+                self._bytes -= lane.bytes
+                self._lanes[feeder] = _Lane(offered=lane.offered)
 
     def close(self) -> None:
         """Release blocked senders; later samples are discarded."""
@@ -139,7 +221,7 @@ class Inbox:
             self._room.notify_all()
 
     def _full(self, more: int) -> bool:
-        return len(self._waiting) + (more > 0) > self._max_samples or self._bytes + more > self._max_bytes
+        return self._length + (more > 0) > self._max_samples or self._bytes + more > self._max_bytes
 
 
 def _size(sample: Sample) -> int:
@@ -152,6 +234,10 @@ EVENTS_WAITING = 10_000
 TELEMETRY_WAITING = 2_000
 RETRY_S = 1.0
 """Time until the next attempt to publish a refused event, s."""
+
+
+Value = bytes | Callable[[], bytes]
+"""JSON, or a function that builds it; the function is called only if something receives the value."""
 
 
 class Publication(NamedTuple):
@@ -182,12 +268,12 @@ class Outgoing:
 
     def __init__(self) -> None:
         self.retry_at: float | None = None
-        self._telemetry: deque[tuple[str, bytes]] = deque(maxlen=TELEMETRY_WAITING)
+        self._telemetry: deque[tuple[str, Value]] = deque(maxlen=TELEMETRY_WAITING)
         self._events: deque[Publication] = deque()
         self._closing = False
         self._wakeup = threading.Condition()
 
-    def add_telemetry(self, key: str, payload: bytes) -> None:
+    def add_telemetry(self, key: str, payload: Value) -> None:
         """Add a value; a full queue drops the oldest."""
         with self._wakeup:
             self._telemetry.append((key, payload))
@@ -208,7 +294,7 @@ class Outgoing:
             self._closing = True
             self._wakeup.notify()
 
-    def next(self) -> Publication | tuple[str, bytes] | None:
+    def next(self) -> Publication | tuple[str, Value] | None:
         """Wait for the next item and remove it; events come first. None after the last one."""
         with self._wakeup:
             while True:

@@ -22,19 +22,24 @@ import math
 import reprlib
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
 from itertools import chain
-from typing import Any
+from typing import Any, Final
 
 import cbor2
 import msgspec
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+import structlog
 from pyarrow import ipc
 
+from gridsec.arrays import Bools, Floats, Ints
 from service.access.signing import MeterKeys, Refusal
+from service.ingest.queues import Sample
 
 T_MIN, T_MAX = 1e8, 1e10
 """Range of Unix times, s (1973 to 2286); values outside are milliseconds, counters or uptimes."""
@@ -46,6 +51,7 @@ SEQ_MAX = 2**63 - 1
 PHASES = 3
 HEAD_BYTES = 200
 NOT_REPORTED = math.nan
+_log = structlog.get_logger("gridsec.runtime")
 
 
 class BadReason(StrEnum):
@@ -83,6 +89,65 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
     t_power: float = NOT_REPORTED  # Unix time of the powers by the meter's clock, s; NaN for the time `t`
 
 
+T, V_VOLT, P_KW, Q_KVAR, T_POWER = range(5)
+"""Rows of `Readings.values`."""
+COLUMNS: Final = 5
+NO_SEQ: Final = -1
+"""Sequence number of a reading without one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Readings:
+    """Usable readings of one feeder as columns, in the order of arrival. n readings, p meters."""
+
+    feeder: str  # its name
+    source: Ints  # (n,) position of the meter among those of the feeder; p for the busbar meter
+    values: Floats  # (5, n) t, v_volt, p_kw, q_kvar, t_power, as in `Reading`
+    seq: Ints  # (n,) sequence numbers; `NO_SEQ` where absent
+    arrival: Floats  # (n,) Unix time of the arrival, s
+    v_phases: Floats | None = None  # (3, n) as in `Reading`, NaN where absent; None if all are
+
+    def __len__(self) -> int:
+        """Number of readings."""
+        return int(self.source.size)
+
+    def phases_of(self, k: int) -> tuple[float, ...] | None:
+        """Return the voltages of the phases of one reading, V; None without any."""
+        if self.v_phases is None or np.isnan(self.v_phases[:, k]).all():
+            return None
+        return tuple(self.v_phases[:, k].tolist())
+
+    def row(self, k: int) -> tuple[int, tuple[float, ...], int, tuple[float, ...] | None]:
+        """Return source, values, sequence number and phases of one reading."""
+        return int(self.source[k]), tuple(self.values[:, k].tolist()), int(self.seq[k]), self.phases_of(k)
+
+    def reading(self, k: int, known: Known) -> Reading:
+        """Return one reading."""
+        source, (t, v_volt, p_kw, q_kvar, t_power), seq, phases = self.row(k)
+        meter = None if source == len(known.order) else known.order[source]
+        number = None if seq == NO_SEQ else seq
+        return Reading(self.feeder, meter, t, v_volt, p_kw, q_kvar, number, phases, t_power)
+
+
+def joined(parts: Sequence[Readings]) -> Readings:
+    """Return readings of the same feeder, one after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    phases = None
+    if any(part.v_phases is not None for part in parts):
+        none = (np.full((PHASES, len(part)), np.nan) for part in parts)
+        each = zip(parts, none, strict=True)
+        phases = np.concatenate([no if part.v_phases is None else part.v_phases for part, no in each], axis=1)
+    return Readings(
+        parts[0].feeder,
+        np.concatenate([part.source for part in parts]),
+        np.concatenate([part.values for part in parts], axis=1),
+        np.concatenate([part.seq for part in parts]),
+        np.concatenate([part.arrival for part in parts]),
+        phases,
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class BadReading:
     """A payload, or an element of one, that was not used."""
@@ -98,15 +163,49 @@ class BadReading:
     count: int = 1
 
 
+ORDERS_KEPT = 32
+"""Number of columns of meters with kept positions, for each feeder."""
+
+
 @dataclass(frozen=True, slots=True)
 class Known:
     """Properties of a feeder that the validation of its readings uses."""
 
-    meters: frozenset[str]  # ids of its meters
+    meters: Collection[str]  # ids of its meters, in order
     nominal_volt: float  # nominal phase-to-neutral voltage of the busbar, V
     power_max_kw: float  # largest plausible magnitude of a customer's active or reactive power, kW or kvar
     # Nominal voltage of each meter behind a transformer, V.
     own_volt: Mapping[str, float] = field(default_factory=dict)
+    order: tuple[str, ...] = field(init=False)  # the meters
+    index: Mapping[str | None, int] = field(init=False)  # position of each meter; the busbar meter is last
+    volt_max: Floats = field(init=False, compare=False)  # largest plausible voltage of each source, V
+    ids: pa.Array = field(init=False, compare=False)  # the meters as a column
+    # Results of `sources_of`, by contents.
+    orders: dict[tuple[Any, ...], Ints] = field(init=False, compare=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        order = tuple(self.meters)
+        object.__setattr__(self, "order", order)
+        object.__setattr__(self, "index", {source: k for k, source in enumerate((*order, None))})
+        highest = np.array([VOLT_FACTOR * self.volt(source) for source in (*order, None)])
+        object.__setattr__(self, "volt_max", highest)
+        object.__setattr__(self, "ids", pa.array(order, pa.string()))
+
+    def sources_of(self, names: pa.Array) -> Ints:
+        """Return the position of each meter of a column, (n,); -1 for other names and nulls.
+
+        The column of a concentrator is mostly the same: the newest results are kept by the column's contents.
+        """
+        buffers = [b"" if one is None else one.to_pybytes() for one in names.buffers()]
+        key = (str(names.type), len(names), names.offset, *buffers)
+        found = self.orders.get(key)
+        if found is None:
+            place = pc.index_in(names, value_set=self.ids.cast(names.type))
+            found = pc.fill_null(place, -1).to_numpy(zero_copy_only=False).astype(np.intp)
+            if len(self.orders) >= ORDERS_KEPT:
+                self.orders.clear()
+            self.orders[key] = found
+        return found
 
     def volt(self, meter: object) -> float:
         """Return the nominal voltage of a meter, or of the busbar for anything else, V."""
@@ -126,18 +225,17 @@ class WireReading(msgspec.Struct, gc=False):
     t_power: float | None = None
 
 
-def plausible(raw: WireReading, known: Known, meter: str | None) -> bool:
-    """True if every number of a well-typed reading of a meter (None: the busbar) is plausible."""
+def plausible(known: Known, source: Ints, values: Floats, seq: Ints) -> Bools:
+    """True for readings with plausible numbers, (n,); NaN stands for an absent power, or time of powers.
+
+    Arguments are columns as in `Readings`; `source` may be -1, which is not plausible.
+    """
+    t, v_volt, p_kw, q_kvar, t_power = values
     limit = known.power_max_kw
-    return (
-        0.0 < raw.v_volt <= VOLT_FACTOR * known.volt(meter)
-        and T_MIN <= raw.t <= T_MAX
-        and (raw.p_kw is None or -limit <= raw.p_kw <= limit)
-        and (raw.q_kvar is None or -limit <= raw.q_kvar <= limit)
-        and (raw.seq is None or 0 <= raw.seq <= SEQ_MAX)
-        and (raw.v_phases is None or _phases_plausible(raw.v_phases, known))
-        and (raw.t_power is None or T_MIN <= raw.t_power <= T_MAX)
-    )
+    good = (source >= 0) & (t >= T_MIN) & (t <= T_MAX) & (v_volt > 0.0) & (v_volt <= known.volt_max[source])
+    good &= ((np.abs(p_kw) <= limit) | np.isnan(p_kw)) & ((np.abs(q_kvar) <= limit) | np.isnan(q_kvar))
+    good &= ((t_power >= T_MIN) & (t_power <= T_MAX)) | np.isnan(t_power)
+    return np.asarray(good & (seq >= NO_SEQ))
 
 
 def _phases_plausible(phases: list[float | None], known: Known) -> bool:
@@ -224,7 +322,7 @@ def judge(value: Any, known: Known, meter: str | None = None, *, in_batch: bool)
     if in_batch and not isinstance(named, str):
         problem = "meter is missing" if named is None else f"meter is {name_of(named)}, not a string"
         findings.add(BadReason.TYPE, problem)
-    elif in_batch and named not in known.meters:
+    elif in_batch and named not in known.index:
         findings.add(BadReason.UNKNOWN_METER, f"the feeder has no meter `{str(named)[:64]}`")
     if findings.of or t is None or v_volt is None:
         return findings
@@ -344,27 +442,28 @@ class ArrowProblem(ValueError):
         super().__init__("; ".join(self.problems))
 
 
-def columns_of(payload: bytes, is_file: bool, names: tuple[str, ...]) -> dict[str, list[Any]]:
-    """Return the named columns of an Arrow IPC stream or file as Python lists, nulls as None.
+def record_batches(
+    payload: bytes, is_file: bool, names: tuple[str, ...]
+) -> tuple[list[pa.RecordBatch], tuple[str, ...]]:
+    """Return the record batches of an Arrow IPC stream or file, and the names that its columns include.
 
-    With `is_file` the payload has the file format (with a footer). Absent columns are left out of the result.
-    Raises ArrowProblem if the payload is not Arrow IPC, is compressed, or a requested column is not a plain
-    column of strings (`meter`), integers (`seq`) or numbers (all others).
+    With `is_file` the payload has the file format (with a footer). Raises ArrowProblem if the payload is not
+    Arrow IPC, is compressed, or a requested column is not a plain column of strings (`meter`), integers
+    (`seq`) or numbers (all others).
     """
     try:
         reader = _open(payload, is_file)
         _check_columns(reader.schema, names)
-        columns: dict[str, list[Any]] = {name: [] for name in names if name in reader.schema.names}
+        batches = []
         for batch in _batches(reader, limit=len(payload)):
             batch.validate(full=True)
-            for name, column in columns.items():
-                column.extend(batch.column(name).to_pylist())
+            batches.append(batch)
     except ArrowProblem:
         raise
     except _UNREADABLE as error:
         detail = str(error).partition("\n")[0] or type(error).__name__
         raise ArrowProblem([f"not Arrow IPC: {detail}"], well_formed=False) from error
-    return columns
+    return batches, tuple(name for name in names if name in reader.schema.names)
 
 
 def _open(payload: bytes, is_file: bool) -> Any:
@@ -457,7 +556,7 @@ DETAILED_PER_REASON = 5
 class DecodedPayload:
     """Readings and bad readings of one payload."""
 
-    readings: tuple[Reading, ...] = ()
+    readings: Readings | None = None
     bad: tuple[BadReading, ...] = ()
 
 
@@ -478,6 +577,8 @@ class Wire:
     prefix: str = "gridsec"  # first chunks of every key, without a final slash
     max_bytes: int = 256 * 1024  # size of the largest accepted payload, bytes
     keys: MeterKeys | None = None  # keys of meters; None accepts readings without signature
+    # Feeder and source of the zenoh keys of single readings so far.
+    places: dict[str, tuple[str, int]] = field(default_factory=dict)
 
     def decode(
         self,
@@ -487,10 +588,12 @@ class Wire:
         *,
         size: int | None = None,
         attachment: bytes = b"",
+        arrival: float = math.nan,
     ) -> DecodedPayload:
         """Return the readings and the bad readings in one payload.
 
-        `size` is the length of the whole payload, bytes, if `payload` is only its beginning. A schema after
+        `size` is the length of the whole payload, bytes, if `payload` is only its beginning. `arrival` is the
+        time of its arrival, Unix s. A schema after
         `;` in the encoding is ignored. The result is never empty: a payload without readings is a
         bad reading.
         """
@@ -510,39 +613,211 @@ class Wire:
             accepted = "application/json" if source.concentrator is None else "JSON, CBOR or Arrow IPC"
             problem = f"encoding `{encoding[:80]}` is not supported; use {accepted}"
             return _refuse(base, BadReason.ENCODING, problem)
-        decoded = decoder(payload, source, self.known[source.feeder], base)
+        decoded = decoder(payload, Payload(source, self.known[source.feeder], base, arrival))
         if self.keys is None:
             return decoded
         check = partial(self.keys.check, key=key, payload=payload, attachment=attachment)
-        return _verified(decoded, check, base)
+        return _verified(decoded, check, self.known[source.feeder], base)
+
+    def gather(self, samples: Sequence[Sample]) -> Gathered:
+        """Decode payloads; single JSON readings of a feeder are validated together.
+
+        A defect of the decoder costs one payload only.
+        """
+        parts: dict[str, list[Readings]] = {}
+        singles: dict[str, _Singles] = {}
+        bad: list[tuple[BadReading, Sample]] = []
+
+        def flush(feeder: str) -> None:
+            readings, refused = self._finish(singles.pop(feeder))
+            bad.extend(refused)
+            parts.setdefault(feeder, []).extend(readings)
+
+        for sample in samples:
+            place = self._place_of(sample)
+            if place is not None:
+                try:
+                    raw = _decode_one(sample.payload)
+                except (msgspec.MsgspecError, RecursionError):
+                    pass
+                else:
+                    feeder, source = place
+                    rows = singles.get(feeder)
+                    if rows is None:
+                        rows = singles[feeder] = _Singles(feeder)
+                    rows.raws.append(raw)
+                    rows.sources.append(source)
+                    rows.samples.append(sample)
+                    continue
+            decoded = self._decoded(sample)
+            bad.extend((one, sample) for one in decoded.bad)
+            if decoded.readings is not None:
+                feeder = decoded.readings.feeder
+                if feeder in singles:
+                    flush(feeder)
+                parts.setdefault(feeder, []).append(decoded.readings)
+        for feeder in list(singles):
+            flush(feeder)
+        return Gathered({feeder: joined(found) for feeder, found in parts.items() if found}, bad)
+
+    def _place_of(self, sample: Sample) -> tuple[str, int] | None:
+        """Feeder and source of a payload that may be a valid single JSON reading; None for all others."""
+        if self.keys is not None or sample.encoding not in JSON_ENCODINGS or sample.size > self.max_bytes:
+            return None
+        place = self.places.get(sample.key)
+        if place is None:
+            source = source_of(sample.key, self.prefix, self.known)
+            if isinstance(source, BadReading) or source.concentrator is not None:
+                return None
+            place = self.places[sample.key] = (source.feeder, self.known[source.feeder].index[source.meter])
+        return place
+
+    def _finish(self, rows: _Singles) -> tuple[list[Readings], list[tuple[BadReading, Sample]]]:
+        """Validate single readings of a feeder together; return the usable and the bad ones."""
+        arrival = np.array([sample.arrival for sample in rows.samples])
+        readings, good = _of_raws(self.known[rows.feeder], rows.feeder, rows.sources, rows.raws, arrival)
+        if good.all():
+            return [readings], []
+        kept: list[Readings] = []
+        bad: list[tuple[BadReading, Sample]] = []
+        for k in np.flatnonzero(~good).tolist():
+            decoded = self._decoded(rows.samples[k])
+            bad.extend((one, rows.samples[k]) for one in decoded.bad)
+            good[k] = decoded.readings is not None
+        if good.any():
+            kept.append(_some(readings, good))
+        return kept, bad
+
+    def _decoded(self, sample: Sample) -> DecodedPayload:
+        """Decode one payload; a defect of the decoder costs this payload only."""
+        try:
+            return self.decode(
+                sample.key,
+                sample.payload,
+                sample.encoding,
+                size=sample.size,
+                attachment=sample.attachment,
+                arrival=sample.arrival,
+            )
+        except Exception as error:  # noqa: BLE001 - one payload must not end the service
+            problem = beginning(f"{type(error).__name__}: {error}")
+            _log.error("a payload could not be decoded", key=sample.key[:HEAD_BYTES], problem=problem)
+            head, key = head_of(sample.payload[:HEAD_BYTES]), beginning(sample.key)
+            return DecodedPayload(bad=(BadReading(BadReason.INTERNAL, (problem,), key, head=head),))
+
+
+@dataclass(frozen=True, slots=True)
+class Gathered:
+    """Decoded payloads of a round."""
+
+    readings: Mapping[str, Readings]  # usable readings of each feeder, by its name
+    bad: list[tuple[BadReading, Sample]]  # bad readings, with their payloads
+
+
+@dataclass(frozen=True, slots=True)
+class _Singles:
+    """Well-typed single readings of one feeder."""
+
+    feeder: str
+    raws: list[WireReading] = field(default_factory=list)
+    sources: list[int] = field(default_factory=list)
+    samples: list[Sample] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class Payload:
+    """Source and arrival of a payload, and the frame of its bad readings."""
+
+    source: Source
+    known: Known
+    base: BadReading
+    arrival: float
+
+    def columns(self, source: Ints, values: Floats, seq: Ints, phases: Floats | None = None) -> Readings:
+        """Return its readings, from columns as in `Readings`."""
+        arrival = np.full(source.size, self.arrival)
+        return Readings(self.source.feeder, source, values, seq, arrival, phases)
+
+
+def _some(readings: Readings, which: Bools) -> Readings:
+    """Return some of the readings."""
+    phases = None if readings.v_phases is None else readings.v_phases[:, which]
+    return Readings(
+        readings.feeder,
+        readings.source[which],
+        readings.values[:, which],
+        readings.seq[which],
+        readings.arrival[which],
+        phases,
+    )
+
+
+def _of_raws(
+    known: Known, feeder: str, sources: Sequence[int], raws: Sequence[WireReading], arrival: Floats
+) -> tuple[Readings, Bools]:
+    """Return well-typed readings as columns, and which of them are plausible, (n,)."""
+    values = np.array(
+        [
+            [raw.t for raw in raws],
+            [raw.v_volt for raw in raws],
+            [raw.p_kw for raw in raws],
+            [raw.q_kvar for raw in raws],
+            [raw.t_power for raw in raws],
+        ],
+        dtype=np.float64,
+    )
+    source = np.array(sources, dtype=np.intp)
+    seq, wrong = _sequence([raw.seq for raw in raws])
+    good = plausible(known, source, values, seq) & ~wrong
+    phases = None
+    for k, v_phases in enumerate([raw.v_phases for raw in raws]):
+        if v_phases is None:
+            continue
+        if not _phases_plausible(v_phases, known):
+            good[k] = False
+        elif any(v is not None for v in v_phases):
+            phases = np.full((PHASES, source.size), np.nan) if phases is None else phases
+            phases[:, k] = np.array(v_phases, dtype=np.float64)
+    return Readings(feeder, source, values, seq, arrival, phases), good
+
+
+def _sequence(numbers: Sequence[int | None]) -> tuple[Ints, Bools]:
+    """Return sequence numbers as a column, and which of them are outside of the permitted range, (n,)."""
+    wrong = np.array([one is not None and not 0 <= one <= SEQ_MAX for one in numbers], dtype=np.bool_)
+    column = [NO_SEQ if one is None or not 0 <= one <= SEQ_MAX else one for one in numbers]
+    return np.array(column, dtype=np.int64), wrong
 
 
 def _verified(
-    decoded: DecodedPayload, check: Callable[[str, str | None], Refusal | None], base: BadReading
+    decoded: DecodedPayload,
+    check: Callable[[str, str | None], Refusal | None],
+    known: Known,
+    base: BadReading,
 ) -> DecodedPayload:
     """Move readings that their keys refuse to the bad ones."""
-    accepted: list[Reading] = []
-    bad = list(decoded.bad)
+    if decoded.readings is None:
+        return decoded
+    readings, bad = decoded.readings, list(decoded.bad)
+    accepted = np.ones(len(readings), dtype=np.bool_)
     more: Counter[BadReason] = Counter()
-    for reading in decoded.readings:
-        refusal = check(reading.feeder, reading.meter)
+    for k, source in enumerate(readings.source.tolist()):
+        meter = None if source == len(known.order) else known.order[source]
+        refusal = check(readings.feeder, meter)
         if refusal is None:
-            accepted.append(reading)
             continue
+        accepted[k] = False
         reason = BadReason(refusal.reason)
         more[reason] += 1
         if more[reason] <= DETAILED_PER_REASON:
-            bad.append(replace(base, reason=reason, problems=(refusal.problem,), meter=reading.meter))
+            bad.append(replace(base, reason=reason, problems=(refusal.problem,), meter=meter))
     for reason, count in more.items():
         if (rest := count - DETAILED_PER_REASON) > 0:
             problem = f"{rest} more elements of the batch: {reason}"
             bad.append(replace(base, reason=reason, problems=(problem,), count=rest))
-    return DecodedPayload(tuple(accepted), tuple(bad))
+    return DecodedPayload(_some(readings, accepted) if accepted.any() else None, tuple(bad))
 
 
-def _decoder(
-    kind: str, source: Source
-) -> Callable[[bytes, Source, Known, BadReading], DecodedPayload] | None:
+def _decoder(kind: str, source: Source) -> Callable[[bytes, Payload], DecodedPayload] | None:
     if kind in JSON_ENCODINGS:
         return _single if source.concentrator is None else _json_batch
     if source.concentrator is not None:
@@ -571,7 +846,7 @@ def source_of(key: str, prefix: str, known: Mapping[str, Known]) -> Source | Bad
     limits = known.get(source.feeder)
     if limits is None:
         return _nowhere(key, BadReason.UNKNOWN_FEEDER, "is the key of a feeder that is not monitored here")
-    if source.meter is not None and source.meter not in limits.meters:
+    if source.meter is not None and source.meter not in limits.index:
         bad = _nowhere(key, BadReason.UNKNOWN_METER, "is the key of a meter that the feeder does not have")
         return replace(bad, feeder=source.feeder)
     return source
@@ -607,41 +882,50 @@ def _parse(payload: bytes) -> Any:
             raise error from None
 
 
-def _single(payload: bytes, source: Source, known: Known, base: BadReading) -> DecodedPayload:
+def _single(payload: bytes, of: Payload) -> DecodedPayload:
+    place = of.known.index[of.source.meter]
     try:
         raw = _decode_one(payload)
     except (msgspec.MsgspecError, RecursionError):
         pass
     else:
-        if plausible(raw, known, source.meter):
-            return DecodedPayload((to_reading(source.feeder, source.meter, raw),))
+        readings, good = _of_raws(of.known, of.source.feeder, [place], [raw], np.array([of.arrival]))
+        if good.all():
+            return DecodedPayload(readings)
     try:
         value = _parse(payload)
     except (ValueError, RecursionError, msgspec.MsgspecError) as error:
-        return _refuse(base, BadReason.SYNTAX, f"not JSON: {error}")
+        return _refuse(of.base, BadReason.SYNTAX, f"not JSON: {error}")
     if value in ([], {}):
-        return _refuse(base, BadReason.EMPTY, "the reading is empty")
-    found = judge(value, known, source.meter, in_batch=False)
-    if isinstance(found, WireReading):
-        return DecodedPayload((to_reading(source.feeder, source.meter, found),))
-    return _refuse(base, found.reason, *found.problems)
+        return _refuse(of.base, BadReason.EMPTY, "the reading is empty")
+    judged = judge(value, of.known, of.source.meter, in_batch=False)
+    if isinstance(judged, Findings):
+        return _refuse(of.base, judged.reason, *judged.problems)
+    arrival = np.array([of.arrival])
+    return DecodedPayload(_of_raws(of.known, of.source.feeder, [place], [judged], arrival)[0])
 
 
-def _json_batch(payload: bytes, source: Source, known: Known, base: BadReading) -> DecodedPayload:
+def _json_batch(payload: bytes, of: Payload) -> DecodedPayload:
     try:
-        rows = _decode_many(payload)
+        raws = _decode_many(payload)
     except (msgspec.MsgspecError, RecursionError):
-        pass
-    else:
-        if rows and all(plausible(raw, known, raw.meter) and raw.meter in known.meters for raw in rows):
-            return DecodedPayload(tuple(to_reading(source.feeder, raw.meter, raw) for raw in rows))
+        raws = []
+    if raws:
+        index = of.known.index
+        sources = [-1 if raw.meter is None else index.get(raw.meter, -1) for raw in raws]
+        arrival = np.full(len(raws), of.arrival)
+        readings, good = _of_raws(of.known, of.source.feeder, sources, raws, arrival)
+        if good.all():
+            return DecodedPayload(readings)
     try:
         value = _parse(payload)
     except (ValueError, RecursionError, msgspec.MsgspecError) as error:
-        return _refuse(base, BadReason.SYNTAX, f"not JSON: {error}")
+        return _refuse(of.base, BadReason.SYNTAX, f"not JSON: {error}")
     if not isinstance(value, list):
-        return _refuse(base, BadReason.TYPE, f"expected a JSON array of readings, not {name_of(value)}")
-    return _batch(value, source, known, base)
+        return _refuse(of.base, BadReason.TYPE, f"expected a JSON array of readings, not {name_of(value)}")
+    if raws and len(value) == len(raws):
+        return _sorted_out(readings, good, value.__getitem__, of)
+    return _batch(value, of)
 
 
 # ---------------------------------------------------------------------------------------------------------
@@ -649,9 +933,10 @@ def _json_batch(payload: bytes, source: Source, known: Known, base: BadReading) 
 
 
 _FIELDS = ("meter", "t", "v_volt", "p_kw", "q_kvar", "seq", "t_power")
+_NUMBERS = ("t", "v_volt", "p_kw", "q_kvar", "t_power")
 
 
-def _cbor(payload: bytes, source: Source, known: Known, base: BadReading) -> DecodedPayload:
+def _cbor(payload: bytes, of: Payload) -> DecodedPayload:
     try:
         columns = cbor2.loads(payload)
     except (
@@ -662,69 +947,162 @@ def _cbor(payload: bytes, source: Source, known: Known, base: BadReading) -> Dec
         MemoryError,
         TypeError,
     ) as error:
-        return _refuse(base, BadReason.SYNTAX, f"not CBOR: {error}")
+        return _refuse(of.base, BadReason.SYNTAX, f"not CBOR: {error}")
     if not isinstance(columns, dict):
-        return _refuse(base, BadReason.TYPE, f"expected a CBOR map of columns, not {name_of(columns)}")
-    return _columns(columns, source, known, base)
-
-
-def _arrow(
-    payload: bytes, source: Source, known: Known, base: BadReading, *, is_file: bool
-) -> DecodedPayload:
-    try:
-        columns = columns_of(payload, is_file, _FIELDS)
-    except ArrowProblem as error:
-        reason = BadReason.TYPE if error.well_formed else BadReason.SYNTAX
-        return _refuse(base, reason, *error.problems)
-    return _columns(columns, source, known, base)
-
-
-_BATCH_DECODERS: Mapping[str, Callable[[bytes, Source, Known, BadReading], DecodedPayload]] = {
-    "application/cbor": _cbor,
-    "application/vnd.apache.arrow.stream": partial(_arrow, is_file=False),
-    "application/vnd.apache.arrow.file": partial(_arrow, is_file=True),
-}
-
-
-def _columns(columns: Mapping[Any, Any], source: Source, known: Known, base: BadReading) -> DecodedPayload:
+        return _refuse(of.base, BadReason.TYPE, f"expected a CBOR map of columns, not {name_of(columns)}")
     present = {name: columns[name] for name in _FIELDS if name in columns}
     problems = [
         f"column `{name}` is {name_of(column)}, not an array"
         for name, column in present.items()
         if not isinstance(column, list)
     ]
-    problems += [f"column `{name}` is missing" for name in ("meter", "t", "v_volt") if name not in present]
+    problems += _missing(present)
     if problems:
-        return _refuse(base, BadReason.TYPE, *problems)
+        return _refuse(of.base, BadReason.TYPE, *problems)
     lengths = {name: len(column) for name, column in present.items()}
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"`{name}` {length}" for name, length in lengths.items())
-        return _refuse(base, BadReason.TYPE, f"the columns differ in length: {listed}")
-    rows = [dict(zip(present, row, strict=True)) for row in zip(*present.values(), strict=True)]
-    return _batch(rows, source, known, base)
+        return _refuse(of.base, BadReason.TYPE, f"the columns differ in length: {listed}")
+    return _of_lists(present, of)
 
 
-def _batch(rows: list[Any], source: Source, known: Known, base: BadReading) -> DecodedPayload:
+def _missing(present: Collection[str]) -> list[str]:
+    return [f"column `{name}` is missing" for name in ("meter", "t", "v_volt") if name not in present]
+
+
+_NUMERIC = frozenset({int, float, type(None)})
+_NAMING = frozenset({str})
+_COUNTING = frozenset({int, type(None)})
+
+
+def _of_lists(columns: Mapping[str, list[Any]], of: Payload) -> DecodedPayload:
+    """Return the readings of columns of equal length, of any contents."""
+
+    def row(k: int) -> dict[str, Any]:
+        return {name: column[k] for name, column in columns.items()}
+
+    size = len(columns["t"])
+    numbers = [columns.get(name) or [None] * size for name in _NUMBERS]
+    names, counts = columns["meter"], columns.get("seq") or [None] * size
+    typed = all(_NUMERIC.issuperset(map(type, column)) for column in numbers)
+    typed = typed and _NAMING.issuperset(map(type, names)) and _COUNTING.issuperset(map(type, counts))
+    if not typed or not size:
+        return _batch([row(k) for k in range(size)], of)
+    try:
+        values = np.array(numbers, dtype=np.float64)
+    except OverflowError:  # an integer of hundreds of digits
+        return _batch([row(k) for k in range(size)], of)
+    source = np.array([of.known.index.get(name, -1) for name in names], dtype=np.intp)
+    seq, wrong = _sequence(counts)
+    good = plausible(of.known, source, values, seq) & ~wrong
+    # NaN is absent only as a null.
+    for column, found in zip(numbers, np.isnan(values), strict=True):
+        for k in np.flatnonzero(found).tolist():
+            good[k] &= column[k] is None
+    return _sorted_out(of.columns(source, values, seq), good, row, of)
+
+
+def _arrow(payload: bytes, of: Payload, *, is_file: bool) -> DecodedPayload:
+    try:
+        batches, present = record_batches(payload, is_file, _FIELDS)
+    except ArrowProblem as error:
+        reason = BadReason.TYPE if error.well_formed else BadReason.SYNTAX
+        return _refuse(of.base, reason, *error.problems)
+    if problems := _missing(present):
+        return _refuse(of.base, BadReason.TYPE, *problems)
+    parts = [_of_batch(batch, present, of) for batch in batches if batch.num_rows]
+    if not parts:
+        return _batch([], of)
+    begins = np.cumsum([0, *(len(readings) for readings, _ in parts)])
+
+    def row(k: int) -> dict[str, Any]:
+        number = int(np.searchsorted(begins, k, side="right")) - 1
+        batch = [one for one in batches if one.num_rows][number]
+        return {name: batch.column(name)[k - int(begins[number])].as_py() for name in present}
+
+    good = np.concatenate([one for _, one in parts])
+    return _sorted_out(joined([readings for readings, _ in parts]), good, row, of)
+
+
+def _of_batch(batch: pa.RecordBatch, present: Collection[str], of: Payload) -> tuple[Readings, Bools]:
+    """Return the readings of a record batch, and which of them are plausible, (n,)."""
+    size = batch.num_rows
+    values = np.full((COLUMNS, size), np.nan)
+    good = np.ones(size, dtype=np.bool_)
+    for number, name in enumerate(_NUMBERS):
+        if name not in present:
+            continue
+        column = batch.column(name)
+        values[number] = column.to_numpy(zero_copy_only=False)
+        absent = np.isnan(values[number])
+        if absent.any():
+            # NaN is absent only as a null.
+            good &= ~(absent & column.is_valid().to_numpy(zero_copy_only=False))
+    seq = np.full(size, NO_SEQ, dtype=np.int64)
+    if "seq" in present:
+        column = batch.column("seq")
+        valid = column.is_valid().to_numpy(zero_copy_only=False)
+        counts = pc.fill_null(column, 0).to_numpy(zero_copy_only=False)
+        fits = (counts >= 0) & (counts <= SEQ_MAX)
+        good &= fits
+        seq[valid & fits] = counts[valid & fits]
+    source = of.known.sources_of(batch.column("meter"))
+    good &= plausible(of.known, source, values, seq)
+    return of.columns(source, values, seq), good
+
+
+_BATCH_DECODERS: Mapping[str, Callable[[bytes, Payload], DecodedPayload]] = {
+    "application/cbor": _cbor,
+    "application/vnd.apache.arrow.stream": partial(_arrow, is_file=False),
+    "application/vnd.apache.arrow.file": partial(_arrow, is_file=True),
+}
+
+
+def _sorted_out(readings: Readings, good: Bools, row: Callable[[int], Any], of: Payload) -> DecodedPayload:
+    """Return plausible readings, and the others as bad readings; `row` returns an element by position."""
+    if good.all():
+        return DecodedPayload(readings)
+    raws, bad = _judged(((k, row(k)) for k in np.flatnonzero(~good).tolist()), of)
+    if raws:
+        return _batch([row(k) for k in range(len(readings))], of)
+    return DecodedPayload(_some(readings, good) if good.any() else None, bad)
+
+
+def _batch(rows: list[Any], of: Payload) -> DecodedPayload:
+    """Return the readings of elements of any contents."""
     if not rows:
-        return _refuse(base, BadReason.EMPTY, "the batch is empty")
-    readings: list[Reading] = []
+        return _refuse(of.base, BadReason.EMPTY, "the batch is empty")
+    raws, bad = _judged(enumerate(rows), of)
+    if not raws:
+        return DecodedPayload(bad=bad)
+    sources = [of.known.index[raw.meter] for raw in raws]
+    arrival = np.full(len(raws), of.arrival)
+    readings, _ = _of_raws(of.known, of.source.feeder, sources, raws, arrival)
+    return DecodedPayload(readings, bad)
+
+
+def _judged(rows: Iterable[tuple[int, Any]], of: Payload) -> tuple[list[WireReading], tuple[BadReading, ...]]:
+    """Return the readings of elements with their positions, and the bad ones with all their problems."""
+    raws: list[WireReading] = []
     bad: dict[BadReason, list[BadReading]] = {}
     more: Counter[BadReason] = Counter()
-    for index, row in enumerate(rows):
-        found = judge(row, known, in_batch=True)
+    for index, row in rows:
+        found = judge(row, of.known, in_batch=True)
         if isinstance(found, WireReading):
-            readings.append(to_reading(source.feeder, found.meter, found))
+            raws.append(found)
             continue
         alike = bad.setdefault(found.reason, [])
         if len(alike) == DETAILED_PER_REASON:
             more[found.reason] += 1
             continue
         meter = row.get("meter") if isinstance(row, dict) else None
-        ours = meter if isinstance(meter, str) and meter in known.meters else None
+        ours = meter if isinstance(meter, str) and meter in of.known.index else None
         listed = tuple(f"element {index}: {problem}" for problem in found.problems)
-        alike.append(replace(base, reason=found.reason, problems=listed, meter=ours, head=head_of(row)))
+        alike.append(replace(of.base, reason=found.reason, problems=listed, meter=ours, head=head_of(row)))
     rest = (
-        replace(base, reason=reason, problems=(f"{count} more elements of the batch: {reason}",), count=count)
+        replace(
+            of.base, reason=reason, problems=(f"{count} more elements of the batch: {reason}",), count=count
+        )
         for reason, count in more.items()
     )
-    return DecodedPayload(tuple(readings), (*chain.from_iterable(bad.values()), *rest))
+    return raws, (*chain.from_iterable(bad.values()), *rest)

@@ -16,6 +16,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from typing import Any
 
+import structlog
 import zenoh
 
 from gridsec.errors import GridsecError
@@ -28,6 +29,7 @@ from service.ingest.queues import (
     Publication,
     Sample,
     StoredEvent,
+    Value,
 )
 
 RING = 8192
@@ -43,6 +45,7 @@ MISSED_AT_ONCE = 1000
 _DIGITS = 18
 """Largest number of digits of an event's number."""
 JSON = "application/json"
+_log = structlog.get_logger("gridsec.zenoh")
 _MULTICAST = "udp/224.0.0.224:7446"
 """Group of zenoh's multicast scouting."""
 
@@ -162,7 +165,7 @@ class Bus:
         self._stack = ExitStack()
         self._threads: list[threading.Thread] = []
         self._outgoing = Outgoing()
-        self._answers: dict[str, bytes] = {}
+        self._answers: dict[str, Value] = {}
         self._answers_lock = threading.Lock()
         self.counts = BusCounts()
         self.failure: str | None = None
@@ -228,6 +231,8 @@ class Bus:
 
     def _published_by_others(self, key: str) -> bool:
         """True for keys that another service with this prefix publishes."""
+        if key.endswith(("/reading", "/readings")):
+            return False
         match key.removeprefix(f"{self._prefix}/").split("/"):
             case [_, "estimate"] | [_, "alarm" | "incident", _]:
                 return True
@@ -245,10 +250,10 @@ class Bus:
 
     # ---------------------------------------------------------------- out
 
-    def telemetry(self, key: str, payload: bytes) -> None:
+    def telemetry(self, key: str, payload: Value) -> None:
         """Publish the newest value of a key, and store it for queries.
 
-        `key` has no prefix; the payload is JSON.
+        `key` has no prefix. A function is called in another thread, for a subscriber or a query.
         """
         with self._answers_lock:
             self._answers[f"{self._prefix}/{key}"] = payload
@@ -305,7 +310,12 @@ class Bus:
                             encoding=JSON,
                             congestion_control=zenoh.CongestionControl.DROP,
                         )
-                    publishers[key].put(value)
+                    if not isinstance(value, bytes) and not _has_receiver(publishers[key]):
+                        continue
+                    text = _text(key, value)
+                    if text is None:
+                        continue
+                    publishers[key].put(text)
             except zenoh.ZError as error:
                 self.counts.publish_failed += 1
                 self.failure = _first_line(error)
@@ -340,7 +350,9 @@ class Bus:
                 with self._answers_lock:
                     known = tuple(self._answers.items())
                 for key, payload in known:
-                    if query.key_expr.intersects(key) and not _reply(query, key, payload):
+                    if not query.key_expr.intersects(key) or (text := _text(key, payload)) is None:
+                        continue
+                    if not _reply(query, key, text):
                         break
 
     def _answer_missed(self, kind: str, query: zenoh.Query) -> None:
@@ -359,6 +371,23 @@ class Bus:
             key = f"{self._prefix}/{event.key}"
             if query.key_expr.intersects(key) and not _reply(query, key, event.payload, event.number):
                 return
+
+
+def _has_receiver(publisher: zenoh.Publisher) -> bool:
+    """True if a subscriber matches. The binding's stubs state a boolean in place of the object."""
+    status = publisher.matching_status
+    return bool(getattr(status, "matching", status))
+
+
+def _text(key: str, value: Value) -> bytes | None:
+    """Payload of a value; None, with a line in the log, if it cannot be built."""
+    if isinstance(value, bytes):
+        return value
+    try:
+        return value()
+    except Exception:  # noqa: BLE001 - the other values are published
+        _log.exception("a value could not be built", key=key)
+        return None
 
 
 def _well_formed(key: str) -> bool:

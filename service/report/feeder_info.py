@@ -10,7 +10,7 @@ from typing import Any
 
 from feeders.format.tables import to_json
 from feeders.model.site import Site
-from service.report.report import FeederReport
+from service.report.report import BUSBAR, FeederReport
 
 
 class FeederStatus(StrEnum):
@@ -23,19 +23,36 @@ class FeederStatus(StrEnum):
     CLEAN = "clean"
 
 
-def status_of(
-    report: FeederReport | None, age_s: float | None, patience_s: float | None, *, failed: bool = False
-) -> FeederStatus:
+def status_of(now: Mapping[str, Any], patience_s: float | None, *, failed: bool = False) -> FeederStatus:
     """Return the status of a feeder: its displayed verdict, unless no value uses a present reading.
 
-    report: the latest report; None before the first tick. A report older than `patience_s`, s, is stale.
+    now: numbers of the latest tick, as of `numbers`; empty before the first one. A tick with an `age_s` above
+    `patience_s`, s, is stale.
     """
     if failed:
         return FeederStatus.NOT_MONITORED
+    age_s = now.get("age_s")
     stale = age_s is not None and patience_s is not None and age_s > patience_s
-    if report is None or report.model_only or stale:
+    if not now or now["model_only"] or stale:
         return FeederStatus.NO_DATA
-    return FeederStatus(str(report.verdict if report.displayed is None else report.displayed.verdict))
+    return FeederStatus(str(now["displayed_verdict"] or now["verdict"]))
+
+
+def numbers(report: FeederReport, age_s: float) -> dict[str, Any]:
+    """Return the numbers of a report in the list of feeders; `TickState.summary` needs no report for them."""
+    shown = report.displayed
+    return {
+        "t": report.t,
+        "verdict": report.verdict,
+        "age_s": age_s,
+        "model_only": report.model_only,
+        "since": report.since,
+        "displayed_verdict": None if shown is None else shown.verdict,
+        "displayed_since": None if shown is None else shown.since,
+        "meters": len(report.meters),
+        "suspects": len(report.suspects) + sum(inverter.suspect for inverter in report.inverters),
+        "silent": sum(one.meter != BUSBAR for one in report.silent),
+    }
 
 
 def summary(site: Site) -> dict[str, Any]:

@@ -26,39 +26,32 @@ from gridsec.grid import Feeder
 from gridsec.grid.three_phase import PHASES
 from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
 from service.ingest.align import Tick
+from service.ingest.reading import P_KW, Q_KVAR, T_POWER, V_VOLT, T
 
 Phase: TypeAlias = Literal["a", "b", "c"]
 
 
 def snapshot(site: Site, tick: Tick) -> Snapshot:
     """Return a tick's readings in the form of `feeders.model.site.to_frame`."""
-    nan = math.nan
-    rows = [
-        (nan, nan, nan, nan, nan) if r is None else (r.v_volt, r.p_kw, r.q_kvar, r.t, r.t_power)
-        for r in tick.readings
-    ]
-    columns = np.array(rows, dtype=np.float64).reshape(-1, 5)
-    age = columns[:, 3] - columns[:, 4]
+    v_volt, p_kw, q_kvar = tick.values[[V_VOLT, P_KW, Q_KVAR], :-1]
+    age = tick.values[T, :-1] - tick.values[T_POWER, :-1]
     return Snapshot(
         t=tick.t,
-        v_volt=columns[:, 0].copy(),
-        p_kw=columns[:, 1].copy(),
-        q_kvar=columns[:, 2].copy(),
+        v_volt=v_volt,
+        p_kw=p_kw,
+        q_kvar=q_kvar,
         v0_volt=busbar_volt(site, tick),
         p_age_s=None if np.isnan(age).all() else age,
         clock_offset_s=np.array(tick.clock_offset, dtype=np.float64) if any(tick.clock_offset) else None,
-        busbar_offset_s=nan if tick.busbar_offset is None else tick.busbar_offset,
+        busbar_offset_s=math.nan if tick.busbar_offset is None else tick.busbar_offset,
     )
 
 
 def busbar_volt(site: Site, tick: Tick) -> Floats | float:
     """Return the reading of the busbar meter, V: one voltage, or in three phases (3,); NaN without one."""
-    if tick.busbar is None:
-        return math.nan
-    phases = tick.busbar.v_phases
     # A balanced feeder has one voltage, also if single phases are not measured.
-    one = phases is None or site.feeder.busbar_phases == 1
-    return tick.busbar.v_volt if one else np.array(phases)
+    one = tick.v_phases is None or site.feeder.busbar_phases == 1
+    return tick.busbar_volt if one else np.array(tick.v_phases)
 
 
 def busbar_phases(site: Site) -> tuple[Phase | None, ...]:
@@ -84,6 +77,8 @@ class ReferenceVoltages:
 
     def model_only(self, site: Site) -> Bools:
         """Return the customers with model-only values, (N,)."""
+        if site.feeder.busbar_phases == 1:
+            return np.full(len(site.feeder.customers), not self.measured[0])
         return np.asarray(~(site.feeder.busbar_incidence() * self.measured).any(axis=1), dtype=np.bool_)
 
 
@@ -91,13 +86,15 @@ def grounds(
     site: Site, tick: Tick, estimate: Estimate | None = None, verdict: Verdict | None = None
 ) -> ReferenceVoltages:
     """Return the readings that the values of a tick use. Without a monitor each reading counts."""
-    used = np.array([reading is not None for reading in tick.readings], dtype=np.bool_)
+    used = tick.seen
     busbar = np.isfinite(np.broadcast_to(busbar_volt(site, tick), len(busbar_phases(site))))
     if estimate is not None:
         used &= estimate.trusted
     if verdict is not None:
         busbar = busbar & (verdict.cause is not Cause.NO_BUSBAR)
         busbar = busbar & ~verdict.busbar if verdict.busbar.size else busbar
+    if site.feeder.busbar_phases == 1:
+        return ReferenceVoltages(np.array([used.any()]), busbar)
     of_meters = site.feeder.busbar_incidence()[site.meters[used]].any(axis=0)
     return ReferenceVoltages(np.asarray(of_meters, dtype=np.bool_), busbar)
 
@@ -134,7 +131,7 @@ def std_volts(site: Site, estimate: Estimate) -> Floats:
 
 def attack_volts(site: Site, tick: Tick, verdict: Verdict) -> Floats:
     """Return the excess of every meter that is named as manipulated, (p,), see `excess_volts`."""
-    reported = np.array([math.nan if r is None else r.v_volt for r in tick.readings], dtype=np.float64)
+    reported = tick.values[V_VOLT, :-1]
     return excess_volts(site.customer_volt[site.meters], reported, verdict.attack, verdict.suspects)
 
 
@@ -394,7 +391,7 @@ _SHOWN: Final = 5
 def reason_of(site: Site, tick: Tick, max_attacked: int, verdict: Verdict) -> str:
     """Return the reason of a verdict, with the meters' names as on the page; the monitor uses customers."""
     suspects = np.flatnonzero(verdict.suspects).tolist()
-    unseen = [k for k, reading in enumerate(tick.readings) if reading is None]
+    unseen = np.flatnonzero(~tick.seen).tolist()
     named = _listed(site, suspects)
     if verdict.cause is Cause.RESIDUALS:
         sure = _named(site, tick, verdict)
@@ -743,22 +740,22 @@ def _report(
     v = std = np.full(len(site.feeder.customers), math.nan)
     if estimate is not None:
         v, std = volts(site.customer_volt, estimate.v2), std_volts(site, estimate)
-    each = zip(site.feeder.customers, map(finite, v), map(finite, std), alone.tolist(), strict=True)
+    each = zip(site.feeder.customers, _numbers(v), _numbers(std), alone.tolist(), strict=True)
     return FeederReport(
         feeder=site.feeder.name,
         t=tick.t,
         verdict=Decision.UNDECIDED if verdict is None else verdict.decision,
-        reason=f"{reason.removesuffix('.')}. {skipped_in_words(tick.skipped)}" if tick.skipped else reason,
+        reason=in_words(reason, tick),
         cause=cause,
         max_attacked=max_attacked,
-        meters=_meters(site, tick, estimate, verdict, volts_of=(v, std), model_only=alone),
+        meters=meter_states(site, tick, estimate, verdict, volts_of=(v, std), model_only=alone),
         buses=_buses(site, estimate, rests_on),
         silent=tuple(Silence(BUSBAR if meter is None else meter, finite(s)) for meter, s in tick.silent),
         v_min_volt=limits.v_min_pu * nominal,
         v_max_volt=limits.v_max_pu * nominal,
         customers=tuple(CustomerState(*one) for one in each),
-        inverters=_inverters(site, estimate, verdict, alone),
-        explanations=() if verdict is None else _explanations(site, verdict),
+        inverters=inverter_states(site, estimate, verdict, alone),
+        explanations=() if verdict is None else explanations(site, verdict),
         busbar=busbar_report(site, tick, estimate, verdict),
         skipped=tick.skipped,
         model_only=not any(measured),
@@ -768,7 +765,15 @@ def _report(
     )
 
 
-def _meters(
+def _numbers(values: Floats) -> list[float | None]:
+    """Return numbers for JSON: None for NaN and infinities."""
+    found: list[float | None] = values.tolist()
+    for k in np.flatnonzero(~np.isfinite(values)):
+        found[k] = None
+    return found
+
+
+def meter_states(
     site: Site,
     tick: Tick,
     estimate: Estimate | None,
@@ -776,44 +781,63 @@ def _meters(
     *,
     volts_of: tuple[Floats, Floats],
     model_only: Bools,
+    which: Bools | None = None,
 ) -> tuple[MeterState, ...]:
-    at, limits, (v, std) = site.meters, site.tables.meta.limits, volts_of
+    """Return the states of meters.
+
+    volts_of, model_only: voltage and standard deviation of every customer, V, and customers with model-only
+        values.
+    which (p,): these meters only; None for all.
+    """
+    chosen = np.arange(site.meters.size) if which is None else np.flatnonzero(which)
+    at, limits = site.meters[chosen], site.tables.meta.limits
+    v, std = (values[at] for values in volts_of)
     unknown = np.full(at.size, math.nan)
     kinds: Sequence[Any] = () if verdict is None else verdict.kinds
-    scores = (unknown,) * 3
+    score, threshold, attack = (unknown,) * 3
+    suspects = np.zeros(at.size, dtype=np.bool_)
     if verdict is not None:
-        scores = (verdict.score, verdict.threshold, attack_volts(site, tick, verdict))
+        score, threshold = verdict.score[chosen], verdict.threshold[chosen]
+        attack, suspects = attack_volts(site, tick, verdict)[chosen], verdict.suspects[chosen]
+    nominal = site.customer_nominal
     # Relative to nominal, behind taps too.
-    ratio = (site.customer_volt / site.customer_nominal) ** 2
+    ratio = (site.customer_volt / nominal) ** 2
     v2 = unknown if estimate is None else (estimate.v2 * ratio)[at]
-    offsets = tick.clock_offset or (None,) * at.size
-    meters = []
-    for k, (customer, reading) in enumerate(zip(at.tolist(), tick.readings, strict=True)):
-        row, volt = site.tables.customers[customer], float(site.customer_nominal[customer])
-        kind = kinds[k] if kinds else None
-        meters.append(
-            MeterState(
-                meter=site.meter_ids[k],
-                bus=row.bus,
-                seen=reading is not None,
-                suspect=verdict is not None and bool(verdict.suspects[k]),
-                score=finite(scores[0][k]),
-                threshold=finite(scores[1][k]),
-                v_volt_reported=None if reading is None else reading.v_volt,
-                v_volt_estimated=finite(v[customer]),
-                v_volt_std=finite(std[customer]),
-                v2_pu_estimated=finite(v2[k]),
-                attack_volt_estimated=finite(scores[2][k]),
-                kind=None if kind is None else str(kind),
-                phase=row.phases if len(row.phases) == 1 else None,
-                v_min_volt=limits.v_min_pu * volt,
-                v_max_volt=limits.v_max_pu * volt,
-                model_only=bool(model_only[customer]),
-                clock_offset_s=offsets[k],
-                customer=row.customer,
-            )
+    offsets = tick.clock_offset or (None,) * site.meters.size
+    reported = tick.values[V_VOLT, :-1][chosen]
+    columns = zip(
+        chosen.tolist(),
+        at.tolist(),
+        tick.seen[chosen].tolist(),
+        suspects.tolist(),
+        nominal[at].tolist(),
+        model_only[at].tolist(),
+        zip(*map(_numbers, (score, threshold, reported, v, std, v2, attack)), strict=True),
+        strict=True,
+    )
+    return tuple(
+        MeterState(
+            site.meter_ids[k],
+            (row := site.tables.customers[customer]).bus,
+            seen,
+            suspect,
+            numbers[0],
+            numbers[1],
+            numbers[2],
+            numbers[3],
+            numbers[4],
+            numbers[5],
+            numbers[6],
+            kind=None if not kinds or kinds[k] is None else str(kinds[k]),
+            phase=row.phases if len(row.phases) == 1 else None,
+            v_min_volt=limits.v_min_pu * volt,
+            v_max_volt=limits.v_max_pu * volt,
+            model_only=alone,
+            clock_offset_s=offsets[k],
+            customer=row.customer,
         )
-    return tuple(meters)
+        for k, customer, seen, suspect, volt, alone, numbers in columns
+    )
 
 
 def _buses(site: Site, estimate: Estimate | None, rests_on: ReferenceVoltages) -> tuple[BusState, ...]:
@@ -822,34 +846,50 @@ def _buses(site: Site, estimate: Estimate | None, rests_on: ReferenceVoltages) -
         alone = not rests_on.measured.any()
         return tuple(BusState(bus, None, None, alone) for bus in names)
     one, phases, model_only = bus_volts(site, estimate.v2_bus, rests_on.measured)
+    each = (tuple(map(finite, row)) for row in phases) if phases.size else (None,) * len(names)
+    return tuple(map(BusState, names, _numbers(one), each, model_only.tolist()))
+
+
+def inverter_states(
+    site: Site,
+    estimate: Estimate | None,
+    verdict: Verdict | None,
+    model_only: Bools,
+    which: Bools | None = None,
+) -> tuple[InverterState, ...]:
+    """Return the states of inverters, of those in `which` (m,) or of all.
+
+    Model-only values test none, but an inverter stays named as manipulated.
+    """
+    base, customers = site.feeder.base_kva, site.droop.customer
+    chosen = np.arange(customers.size) if which is None else np.flatnonzero(which)
+    alone = model_only[customers[chosen]]
+    asked = named = np.zeros(chosen.size, dtype=np.bool_)
+    x = wrong = np.full(chosen.size, math.nan)
+    if verdict is not None and verdict.inverters.size:
+        asked = ~(verdict.unjudged[chosen] if verdict.unjudged.size else asked)
+        named = asked & verdict.inverters[chosen]
+        wrong = np.where(asked & ~alone, base * verdict.inverter_attack[chosen], math.nan)
+    if estimate is not None:
+        x = base * estimate.x[chosen]
+    rows = [site.tables.customers[k] for k in customers[chosen].tolist()]
     return tuple(
-        BusState(bus, finite(v), tuple(map(finite, row)) if row.size else None, alone)
-        for bus, v, row, alone in zip(names, one, phases, model_only.tolist(), strict=True)
+        map(
+            InverterState,
+            [row.customer for row in rows],
+            [row.bus for row in rows],
+            [row.meter or None for row in rows],
+            (asked & ~alone).tolist(),
+            named.tolist(),
+            _numbers(x),
+            _numbers(wrong),
+            alone.tolist(),
+        )
     )
 
 
-def _inverters(
-    site: Site, estimate: Estimate | None, verdict: Verdict | None, model_only: Bools
-) -> tuple[InverterState, ...]:
-    """Reports of all inverters; model-only values test none, but an inverter stays named as manipulated."""
-    base = site.feeder.base_kva
-    judges = verdict is not None and verdict.inverters.size > 0
-    out = []
-    for i, customer in enumerate(site.droop.customer.tolist()):
-        row, alone = site.tables.customers[customer], bool(model_only[customer])
-        asked = verdict is not None and judges and not (verdict.unjudged.size and verdict.unjudged[i])
-        named = verdict is not None and asked and bool(verdict.inverters[i])
-        judged = asked and not alone
-        wrong = base * verdict.inverter_attack[i] if verdict is not None and judged else math.nan
-        x = math.nan if estimate is None else base * estimate.x[i]
-        meter = row.meter or None
-        out.append(
-            InverterState(row.customer, row.bus, meter, judged, named, finite(x), finite(wrong), alone)
-        )
-    return tuple(out)
-
-
-def _explanations(site: Site, verdict: Verdict) -> tuple[ExplanationReport, ...]:
+def explanations(site: Site, verdict: Verdict) -> tuple[ExplanationReport, ...]:
+    """Return the explanations of a verdict."""
     owners = [site.feeder.customers[int(c)] for c in site.droop.customer]
     return tuple(
         ExplanationReport(
@@ -860,6 +900,11 @@ def _explanations(site: Site, verdict: Verdict) -> tuple[ExplanationReport, ...]
         )
         for e in verdict.explanations
     )
+
+
+def in_words(reason: str, tick: Tick) -> str:
+    """Return the reason of a verdict, with a sentence about skipped ticks."""
+    return f"{reason.removesuffix('.')}. {skipped_in_words(tick.skipped)}" if tick.skipped else reason
 
 
 def skipped_in_words(count: int) -> str:

@@ -30,7 +30,7 @@ import structlog
 from service.alarms.incidents import Action, Incident, IncidentEvent, event_json
 from service.alarms.state_machine import Alarm, AlarmTransition, Change, carried
 from service.alarms.state_machine import to_json as alarm_json
-from service.ingest.queues import BusCounts, StoredEvent
+from service.ingest.queues import BusCounts, StoredEvent, Value
 from service.metrics import Metrics
 from service.report.report import FeederReport
 from service.store import AlarmEvent, OutcomeUnknown, Rejected, Store, StoreUnavailable
@@ -211,7 +211,7 @@ class Publisher(Protocol):
     failure: str | None
     counts: BusCounts
 
-    def telemetry(self, key: str, payload: bytes) -> None:
+    def telemetry(self, key: str, payload: Value) -> None:
         """Publish the newest value of a key."""
 
     def event(

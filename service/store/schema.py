@@ -272,6 +272,8 @@ def words_of(alarm: Alarm) -> str:
         alarm.comment,
     )
     return " ".join(part for part in parts if part).lower()
+
+
 def _add_rollup(connection: sa.Connection) -> None:
     ROLLUP.create(connection)
 

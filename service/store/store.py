@@ -14,11 +14,12 @@ import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import sqlalchemy as sa
 import structlog
 
+from gridsec.interface import Cause, Decision
 from service.alarms.incidents import Action, Shelf
 from service.alarms.state_machine import Alarm, AlarmState, AlarmTransition, Change, from_json, to_json
 from service.report.report import FeederReport
@@ -418,6 +419,11 @@ class Store(Reader):
                     self._lock.release()
 
     @property
+    def history_rules(self) -> HistoryRules:
+        """Grid and duration of the history."""
+        return self._history_rules
+
+    @property
     def last_event(self) -> int:
         """Number of the newest event; without a call to the database."""
         return self._last_event
@@ -688,8 +694,28 @@ class Mark:
     suspects: tuple[str, ...]
 
 
-def mark(report: FeederReport) -> Mark:
-    """Return the mark of a report."""
+class Marked(Protocol):
+    """Tick that the history may keep: a report, or the result that it is built from."""
+
+    @property
+    def t(self) -> float:
+        """Unix time, s."""
+
+    @property
+    def verdict(self) -> Decision:
+        """Verdict."""
+
+    @property
+    def cause(self) -> Cause:
+        """Cause of the verdict."""
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        """Meters that the verdict names as manipulated."""
+
+
+def mark(report: Marked) -> Mark:
+    """Return the mark of a tick."""
     return Mark(report.t, str(report.verdict), str(report.cause), report.suspects)
 
 

@@ -37,7 +37,7 @@ from service.api.routes import create_api
 from service.engine.commissioning import CommissioningProgress
 from service.engine.operators import SHELVE_MOST_S, Operators
 from service.errors import FeederFixed, FeederUnknown, TooManyFeeders
-from service.report.feeder_info import revision
+from service.report.feeder_info import numbers, revision
 from service.report.report import BusState, FeederReport, MeterState, Silence
 from service.store import Store
 from service.store.committer import Wish
@@ -241,6 +241,10 @@ class SmallService:
 
     def unloaded(self, name: str) -> str | None:
         return self.cannot_load.get(name)
+
+    def summary(self, name: str) -> dict[str, Any]:
+        report = self.report(name)
+        return {} if report is None else numbers(report, self.age(report))
 
     def report(self, name: str) -> FeederReport | None:
         return self.reports.get(name)

@@ -16,7 +16,7 @@ from typing import Any
 import httpx
 
 from service.app import Running, serve
-from service.ingest.queues import BusConfig, BusCounts
+from service.ingest.queues import BusConfig, BusCounts, Value
 from service.ingest.zenoh_bus import MeterClient
 from service.settings import settings
 
@@ -61,9 +61,9 @@ class Outlet:
         self.withdrawn: list[str] = []
         self.confirms = confirms
 
-    def telemetry(self, key: str, payload: bytes) -> None:
+    def telemetry(self, key: str, payload: Value) -> None:
         assert key == f"{FEEDER}/estimate"
-        self.estimates.append(json.loads(payload))
+        self.estimates.append(json.loads(payload if isinstance(payload, bytes) else payload()))
 
     def event(
         self,

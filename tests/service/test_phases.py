@@ -18,11 +18,11 @@ from service.api.models import FeederDetail, State
 from service.cli.simulate import Pace, payload_of, play
 from service.engine.feeder_monitor import known_of
 from service.engine.replay import ReplayCounts, replay
-from service.ingest.align import Tick
-from service.ingest.reading import BadReason, DecodedPayload, Reading, Wire
+from service.ingest.reading import BadReason, Reading, Wire
 from service.report.feeder_info import detail
 from service.report.report import snapshot
 from tests.service.running import service, until
+from tests.service.ticks import Listed, listed, tick_of
 
 EUROPEAN = "ieee-european-lv"
 START = 1_795_212_000.0
@@ -39,10 +39,11 @@ def scenario(site: Site) -> Scenario:
     return Scenario(seed=6, start=START, duration_s=40.0, attacks=attacks)
 
 
-def decode(site: Site, **changed: Any) -> DecodedPayload:
+def decode(site: Site, **changed: Any) -> Listed:
     wire = Wire({EUROPEAN: known_of(site)})
     reading = {"t": START, "v_volt": 240.0, "v_phases": [239.0, 240.0, 241.0]} | changed
-    return wire.decode(f"gridsec/{EUROPEAN}/substation/reading", msgspec.json.encode(reading))
+    payload = msgspec.json.encode(reading)
+    return listed(wire.decode(f"gridsec/{EUROPEAN}/substation/reading", payload), known_of(site))
 
 
 def test_the_busbar_tells_its_phases_apart(site: Site) -> None:
@@ -81,7 +82,7 @@ def test_phases_do_not_matter_to_a_balanced_feeder() -> None:
     none = (None,) * len(village.meter_ids)
     for phases in (None, (229.0, float("nan"), 233.0), (0.0, 0.0, 0.0)):
         busbar = Reading(village.feeder.name, None, START, 231.0, v_phases=phases)
-        said = snapshot(village, Tick(START, none, busbar, ()))
+        said = snapshot(village, tick_of(START, none, busbar, ()))
         assert said.v0_volt == 231.0
         assert to_frame(village, said).v0_phases is None
 

@@ -25,6 +25,7 @@ from service.report.report import to_json as report_json
 from tests.feeders import stations
 from tests.feeders.stations import LV, MV
 from tests.service.played import replayed
+from tests.service.ticks import listed
 
 START = 1_795_212_000.0
 T_ON = START + 20.0
@@ -120,4 +121,4 @@ def test_a_reading_is_absurd_by_its_own_level() -> None:
         b'{"meter": "a1-east", "t": 1795212000.0, "v_volt": 5000.0}]'
     )
     decoded = wire.decode("gridsec/two-levels/concentrator/c/readings", both, "application/json")
-    assert [reading.meter for reading in decoded.readings] == ["sawmill"]
+    assert [reading.meter for reading in listed(decoded, known_of(site)).readings] == ["sawmill"]

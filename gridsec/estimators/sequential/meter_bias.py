@@ -433,18 +433,12 @@ def progress(design: SequentialDesign, commission: Commission) -> LearningProgre
     if learning is None:
         return LearningProgress((LearningState.LEARNED,) * p, (None,) * p, expected)
     late = learning.watched_s >= _PATIENCE * expected
-    worst = learning.lost_s.argmax(axis=0)
-    lags = _late(design, learning)
-    state, reason = [], list[LearningReason | None]()
-    for k, open_ in enumerate(learning.open):
-        if not open_:
-            state.append(LearningState.LEARNED)
-        elif late[k]:
-            state.append(LearningState.STALLED)
-        else:
-            state.append(LearningState.LEARNING if learning.time_s[k] > 0 else LearningState.WAITING)
-        reason.append(REASONS[worst[k]] if lags[k] else None)
-    return LearningProgress(tuple(state), tuple(reason), expected)
+    states = (LearningState.WAITING, LearningState.LEARNING, LearningState.STALLED, LearningState.LEARNED)
+    number = np.where(learning.open, np.where(late, 2, np.where(learning.time_s > 0, 1, 0)), 3)
+    worst = np.where(_late(design, learning), learning.lost_s.argmax(axis=0), len(REASONS))
+    reasons = (*REASONS, None)
+    state = tuple(states[k] for k in number.tolist())
+    return LearningProgress(state, tuple(reasons[k] for k in worst.tolist()), expected)
 
 
 def _late(design: SequentialDesign, learning: Learning) -> Bools:

@@ -17,6 +17,7 @@ from service.access.signing import read_meter_keys, signed_bytes
 from service.ingest.reading import Known, Wire
 from service.settings import SettingsInvalid, settings
 from tests.codes import refused
+from tests.service.ticks import listed
 
 PRIVATE, SECRET = Ed25519PrivateKey.from_private_bytes(bytes(range(32))), bytes(range(32))
 READING = b'{"t": 1795212000.0, "v_volt": 231.0}'
@@ -25,7 +26,7 @@ town,m01,ed25519,{base64.b64encode(PRIVATE.public_key().public_bytes_raw()).deco
 town,substation,hmac,{base64.b64encode(SECRET).decode()}
 town,m02,certificate,c1
 """
-KNOWN = {"town": Known(frozenset({"m01", "m02", "m03"}), 231.0, 100.0)}
+KNOWN = {"town": Known(("m01", "m02", "m03"), 231.0, 100.0)}
 
 
 def attached(scheme: str, epoch: int, seq: int, key: str, payload: bytes) -> bytes:
@@ -43,7 +44,7 @@ def wire(tmp_path: Path) -> Wire:
 
 def result(wire: Wire, key: str, payload: bytes = READING, attachment: bytes = b"") -> list[str]:
     """Reasons of the bad readings and ids of the good ones."""
-    decoded = wire.decode(f"gridsec/town/{key}", payload, attachment=attachment)
+    decoded = listed(wire.decode(f"gridsec/town/{key}", payload, attachment=attachment), KNOWN["town"])
     return [*(str(one.reason) for one in decoded.bad), *(str(one.meter) for one in decoded.readings)]
 
 

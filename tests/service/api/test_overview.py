@@ -10,7 +10,7 @@ import pytest
 
 from gridsec.interface import Cause
 from service.api.overview import Order, Standing, page, standing
-from service.report.feeder_info import FeederStatus, status_of
+from service.report.feeder_info import FeederStatus, numbers, status_of
 from service.store import AlarmCounts
 from tests.service.asking import T0, Setup
 
@@ -32,7 +32,8 @@ def fleet(village: type, count: int, seed: int) -> list[Standing]:
         fields["phase"] = "failed" if kind == "failed" else "watching"
         active = draw.randrange(4)
         alarms = AlarmCounts(active, draw.randrange(active + 1))
-        found.append(standing(fields, report, 9.0 if kind == "stale" else 1.0, alarms))
+        age_s = 9.0 if kind == "stale" else 1.0
+        found.append(standing(fields, {} if report is None else numbers(report, age_s), alarms))
     return found
 
 
@@ -72,12 +73,13 @@ def test_pages_in_order_make_the_whole_list(village: type, seed: int) -> None:
 
 def test_only_present_readings_make_a_verdict(village: type) -> None:
     report = village("village").report(T0, lies={"H1": 9.0})
-    assert status_of(report, 1.0, 5.0) is FeederStatus.ATTACKED
-    assert status_of(report, 5.1, 5.0) is FeederStatus.NO_DATA
-    assert status_of(replace(report, model_only=True), 1.0, 5.0) is FeederStatus.NO_DATA
-    assert status_of(None, None, 5.0) is FeederStatus.NO_DATA
-    assert status_of(report, 1.0, 5.0, failed=True) is FeederStatus.NOT_MONITORED
-    assert status_of(report, 1.0, None) is FeederStatus.ATTACKED
+    now = numbers(report, 1.0)
+    assert status_of(now, 5.0) is FeederStatus.ATTACKED
+    assert status_of(numbers(report, 5.1), 5.0) is FeederStatus.NO_DATA
+    assert status_of(numbers(replace(report, model_only=True), 1.0), 5.0) is FeederStatus.NO_DATA
+    assert status_of({}, 5.0) is FeederStatus.NO_DATA
+    assert status_of(now, 5.0, failed=True) is FeederStatus.NOT_MONITORED
+    assert status_of(now, None) is FeederStatus.ATTACKED
 
 
 def test_the_list_over_http(setup: Setup) -> None:

@@ -321,8 +321,8 @@ def test_a_clock_that_is_set_back_costs_nothing_that_was_learned(
         live = rounds(store, site)
         feed(live, samples(honest, 0, 70))
         before, monitor = known(live), live.monitors[FEEDER]
-        assert monitor.report is not None
-        monitor.report = replace(monitor.report, t=START + 1e6)
+        assert monitor.latest is not None
+        monitor.latest = replace(monitor.latest, tick=replace(monitor.latest.tick, t=START + 1e6))
         feed(live, samples(honest, 70, 80))
         assert same(known(live), before)
 
@@ -474,9 +474,9 @@ def test_a_stalled_meter_raises_an_alarm_that_ends_when_the_meter_is_learned(
         assert (ended.id, ended.state) == (alarm.id, AlarmState.CLEARED)
         assert ended.t_cleared == learned + 5.0
         assert learning_counts(live) == {"learned": 13.0}
-        live.metrics.count_learning(replace(report, learning=None))
+        live.metrics.count_learning(FEEDER, None)
         assert learning_counts(live) == {"learned": 13.0}
-        live.metrics.count_learning(replace(report, learning=LearningReport()))
+        live.metrics.count_learning(FEEDER, LearningReport())
         assert learning_counts(live) == {}
         live.metrics.forget(FEEDER)
         assert "gridsec_meters_learning{" not in live.metrics.exposition().decode()

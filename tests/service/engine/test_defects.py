@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -168,7 +167,7 @@ def test_what_was_found_before_a_defect_is_not_lost(
         live.committer.publisher = outlet = Outlet()
         live.monitors[FEEDER].install(design(site))
         live.begin()
-        live.cycle([replace(sample, arrival=wall) for sample in attacked])
+        live.cycle([sample._replace(arrival=wall) for sample in attacked])
         assert not outlet.estimates
         wall = START + 30.5
         live.cycle([])
@@ -206,7 +205,7 @@ def test_alarms_of_before_a_defect_in_the_alarms_reach_the_database(
         live.committer.publisher = outlet = Outlet()
         live.monitors[FEEDER].install(design(site))
         live.begin()
-        live.cycle([replace(sample, arrival=wall) for sample in attacked])
+        live.cycle([sample._replace(arrival=wall) for sample in attacked])
         wall = START + 30.5
         live.cycle([])
         monitor = live.monitors[FEEDER]

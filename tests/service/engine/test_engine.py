@@ -86,7 +86,7 @@ def test_a_backlog_makes_no_tick_blind(site: Site, attacked: list[Sample], path:
         for first in range(0, len(attacked), 100):
             rest = attacked[first + 100 :]
             wall = max(wall, attacked[first : first + 100][-1].arrival + late_s)
-            oldest = rest[0].arrival if rest else None
+            oldest = {FEEDER: rest[0].arrival} if rest else {}
             live.cycle(attacked[first : first + 100], lambda oldest=oldest: oldest)
         assert live.monitors[FEEDER].aligner.restarts == 0
         heard = [e for e in outlet.estimates if e["t"] < START + 39]
@@ -458,6 +458,7 @@ def test_an_old_report_is_told_to_be_old(
         while runtime.report(FEEDER) is None or not runtime.ready()[0]:  # noqa: ASYNC110
             await asyncio.sleep(0.01)
         monkeypatch.setattr(FeederMonitor, "reach", hangs)
+        wall += 1.0
         await asyncio.to_thread(hangs_now.wait, 20.0)
         report = runtime.report(FEEDER)
         assert report is not None

@@ -225,8 +225,8 @@ def test_a_clock_that_is_set_back_clears_nobody(
         live, told = watching(store, site)
         feed(live, samples(lying, END, END + 6))
         monitor = live.monitors[FEEDER]
-        assert monitor.report is not None
-        monitor.report = replace(monitor.report, t=START + 1e6)
+        assert monitor.latest is not None
+        monitor.latest = replace(monitor.latest, tick=replace(monitor.latest.tick, t=START + 1e6))
         feed(live, samples(lying, END + 6, END + 40))
         assert {told.suspects(k) for k in range(len(told.estimates))} == {LIARS}
 

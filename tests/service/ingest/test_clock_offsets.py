@@ -18,6 +18,7 @@ from service.ingest.reading import Reading
 from service.report.report import snapshot, to_json
 from tests.service.played import ingest
 from tests.service.reports import meter, report
+from tests.service.ticks import tick_of
 
 T0 = 1_795_212_000.0
 METERS = tuple("abcdefgh")
@@ -167,7 +168,7 @@ def test_the_clock_of_the_busbar_meter_is_measured_and_shown() -> None:
     shown = to_json(watch.report)
     assert shown["busbar"]["clock_offset_s"] == pytest.approx(2.0, abs=0.15)
     assert {m["clock_offset_s"] for m in shown["meters"]} == {None}
-    tick = Tick(T0, (None,) * len(site.meter_ids), None, (), busbar_offset=2.0)
+    tick = tick_of(T0, (None,) * len(site.meter_ids), None, (), busbar_offset=2.0)
     assert to_frame(site, snapshot(site, tick)).busbar_offset == 2.0
     assert np.isnan(to_frame(site, snapshot(site, replace(tick, busbar_offset=None))).busbar_offset)
 

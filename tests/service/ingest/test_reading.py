@@ -15,10 +15,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyarrow import ipc
 
-from service.ingest.reading import DETAILED_PER_REASON, BadReason, DecodedPayload, Known, Reading, Wire
+from service.ingest.reading import DETAILED_PER_REASON, BadReason, Known, Reading, Wire
+from tests.service.ticks import Listed, listed
 
 T = 1_795_212_000.25
-KNOWN = {"village": Known(frozenset({"a", "b", "c"}), 230.94, 10_000.0)}
+KNOWN = {"village": Known(("a", "b", "c"), 230.94, 10_000.0)}
 WIRE = Wire(KNOWN)
 METER = "gridsec/village/meter/a/reading"
 BUSBAR = "gridsec/village/substation/reading"
@@ -26,11 +27,12 @@ BATCH = "gridsec/village/concentrator/k1/readings"
 STREAM, FILE = "application/vnd.apache.arrow.stream", "application/vnd.apache.arrow.file"
 
 
-def decode(payload: bytes | object, key: str = METER, encoding: str = "application/json") -> DecodedPayload:
-    return WIRE.decode(key, payload if isinstance(payload, bytes) else json.dumps(payload).encode(), encoding)
+def decode(payload: bytes | object, key: str = METER, encoding: str = "application/json") -> Listed:
+    data = payload if isinstance(payload, bytes) else json.dumps(payload).encode()
+    return listed(WIRE.decode(key, data, encoding), KNOWN["village"])
 
 
-def only_bad(decoded: DecodedPayload) -> tuple[BadReason, tuple[str, ...]]:
+def only_bad(decoded: Listed) -> tuple[BadReason, tuple[str, ...]]:
     assert not decoded.readings
     (bad,) = decoded.bad
     return bad.reason, bad.problems
@@ -42,7 +44,8 @@ def good(**changes: Any) -> dict[str, Any]:
 
 def test_the_reading_of_the_documentation() -> None:
     payload = b'{"t": 1795212000.25, "seq": 17, "v_volt": 231.4, "p_kw": 0.8, "q_kvar": 0.1}'
-    assert decode(payload) == DecodedPayload((Reading("village", "a", 1795212000.25, 231.4, 0.8, 0.1, 17),))
+    (found,) = decode(payload).readings
+    assert repr(found) == repr(Reading("village", "a", 1795212000.25, 231.4, 0.8, 0.1, 17))
 
 
 @pytest.mark.parametrize(
@@ -325,7 +328,7 @@ VALUES = st.recursive(
 FIELDS = st.sampled_from(["t", "v_volt", "p_kw", "q_kvar", "seq", "meter", "t_power", "x"])
 
 
-def sound(decoded: DecodedPayload) -> None:
+def sound(decoded: Listed) -> None:
     assert decoded.readings or decoded.bad
     for reading in decoded.readings:
         assert reading.meter in {"a", "b", "c"}
@@ -349,10 +352,10 @@ def test_any_key_is_kept_printable(name: str, payload: bytes, odd: bool) -> None
     """zenoh's keys may hold any character, NUL too, which not every database can keep."""
     chunk = name.replace("/", "") + "\0" * odd
     key = f"gridsec/village/concentrator/{chunk}/readings"
-    decoded = WIRE.decode(key, payload, "application/json")
+    decoded = decode(payload, key)
     sound(decoded)
     assert all(len(bad.key) <= 10 * 200 for bad in decoded.bad)
-    sound(WIRE.decode(key.replace("village", chunk), payload, chunk))
+    sound(decode(payload, key.replace("village", chunk), chunk))
 
 
 @given(st.dictionaries(FIELDS, VALUES, max_size=7), st.booleans())

@@ -35,6 +35,7 @@ from tests.service.commands import command, plain
 from tests.service.played import ingest
 from tests.service.reports import meter, report
 from tests.service.running import FEEDER, InProcess, service, until
+from tests.service.ticks import tick_of
 
 START = 1_795_212_000.0
 EUROPEAN = "ieee-european-lv"
@@ -54,7 +55,7 @@ def tick(site: Site, v_volt: float | None, v_phases: tuple[float, ...] | None = 
     """All meters read nominal, the busbar's something else."""
     readings = tuple(Reading(site.feeder.name, one, START, site.feeder.base_volt) for one in site.meter_ids)
     busbar = None if v_volt is None else Reading(site.feeder.name, None, START, v_volt, v_phases=v_phases)
-    return Tick(START, readings, busbar, ())
+    return tick_of(START, readings, busbar, ())
 
 
 def said(

@@ -25,6 +25,7 @@ from service.report.report import BUSBAR, FeederReport, blind, build, snapshot, 
 from service.store import Store
 from tests.service.engine.test_silence import QUIET_VOLT, START, Street
 from tests.service.running import FEEDER, service, until
+from tests.service.ticks import tick_of
 
 EUROPEAN = "ieee-european-lv"
 LISTS = ("meters", "customers", "inverters", "buses")
@@ -143,15 +144,15 @@ def test_a_sound_verdict_raises_no_voltage_alarm_from_the_model_alone(site: Site
     estimator = design(site)
     state = estimator.init(START, None)
     readings = tuple(Reading(FEEDER, meter, START, QUIET_VOLT, 0.0, 0.0) for meter in site.meter_ids)
-    live = Tick(START, readings, Reading(FEEDER, None, START, QUIET_VOLT), ())
+    live = tick_of(START, readings, Reading(FEEDER, None, START, QUIET_VOLT), ())
     _, estimate, verdict = estimator.step(state, to_frame(site, snapshot(site, live)))
     sound = replace(verdict, cause=Cause.SILENT_METERS)
     high = replace(estimate, v2=estimate.v2 * 1.3, v2_bus=estimate.v2_bus * 1.3)
-    none = replace(live, readings=(None,) * len(readings), busbar=None)
+    none = replace(live, values=np.full_like(live.values, np.nan))
     alarms = {}
     for tick in (live, none):
         found = conditions(build(site, tick, 2, high, sound))
-        alarms[tick.busbar is None] = {c.known for c in found if c.kind is AlarmKind.VOLTAGE_LIMIT}
+        alarms[not tick.seen.any()] = {c.known for c in found if c.kind is AlarmKind.VOLTAGE_LIMIT}
     assert alarms == {False: {True}, True: {False}}
 
 
@@ -163,7 +164,7 @@ def test_readings_that_are_not_trusted_are_no_ground(site: Site) -> None:
     readings = tuple(
         Reading(FEEDER, meter, START, 245.0) if i == k else None for i, meter in enumerate(site.meter_ids)
     )
-    tick = Tick(START, readings, None, ())
+    tick = tick_of(START, readings, None, ())
     _, estimate, verdict = estimator.step(state, to_frame(site, snapshot(site, tick)))
     which = np.arange(len(readings)) == k
     named = build(site, tick, 2, replace(estimate, trusted=~which), replace(verdict, suspects=which))
@@ -189,7 +190,7 @@ def in_phases(site: Site, phases: str, v_phases: tuple[float, ...] | None) -> Ti
     busbar = None
     if v_phases is not None:
         busbar = Reading(site.feeder.name, None, START, base, v_phases=v_phases)
-    return Tick(START, readings, busbar, ())
+    return tick_of(START, readings, busbar, ())
 
 
 def test_in_three_phases_each_phase_needs_a_reading_of_its_own() -> None:

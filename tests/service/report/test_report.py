@@ -7,7 +7,6 @@ import math
 import re
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -20,7 +19,7 @@ from gridsec.interface import Cause, Decision, Estimate, Explanation, Manipulati
 from service.alarms.conditions import AlarmKind, conditions
 from service.engine.feeder_monitor import design
 from service.ingest.align import Tick
-from service.ingest.reading import Reading
+from service.ingest.reading import P_KW, T_POWER, Reading
 from service.report.report import (
     BUSBAR,
     ExplanationReport,
@@ -31,6 +30,7 @@ from service.report.report import (
     snapshot,
     to_json,
 )
+from tests.service.ticks import tick_of
 
 T = 1_795_212_000.0
 
@@ -47,7 +47,7 @@ def tick(site: Site, lie: dict[int, float] | None = None, unseen: tuple[int, ...
         for k, meter in enumerate(site.meter_ids)
     )
     silent = tuple((site.meter_ids[k], math.inf) for k in unseen)
-    return Tick(T, readings, Reading(site.feeder.name, None, T, 1.01 * base), (*silent, (None, 12.5)))
+    return tick_of(T, readings, Reading(site.feeder.name, None, T, 1.01 * base), (*silent, (None, 12.5)))
 
 
 def judged(site: Site, lie: float, meter: int) -> tuple[Estimate, Verdict]:
@@ -124,7 +124,7 @@ def test_the_monitor_s_own_sentences_name_no_customer_alone(site: Site) -> None:
     for sample in simulate(site, Scenario(seed=4, start=T, duration_s=40.0, attacks=attacks)):
         heard = {r.meter: r for r in sample.readings if not (r.meter == "m01" and 32 <= sample.t - T < 36)}
         readings = tuple(heard.get(meter) for meter in site.meter_ids)
-        now = Tick(sample.t, readings, heard[""], ())  # type: ignore[arg-type]
+        now = tick_of(sample.t, readings, heard[""], ())  # type: ignore[arg-type]
         state, estimate, verdict = finished.step(state, to_frame(site, snapshot(site, now)))
         report = build(site, now, 2, estimate, verdict)
         said.add(report.cause)
@@ -191,10 +191,9 @@ def test_snapshots_keep_the_order_of_the_meters(site: Site) -> None:
 def test_snapshots_have_the_age_of_powers_with_a_time_of_their_own(site: Site) -> None:
     now = tick(site, unseen=(2,))
     assert snapshot(site, now).p_age_s is None
-    first = now.readings[0]
-    assert first is not None
-    late = msgspec.structs.replace(first, t_power=T - 60.0)
-    age = snapshot(site, replace(now, readings=(late, *now.readings[1:]))).p_age_s
+    values = now.values.copy()
+    values[T_POWER, 0] = T - 60.0
+    age = snapshot(site, replace(now, values=values)).p_age_s
     assert age is not None
     assert age[0] == 60.0
     assert np.isnan(age[1:]).all()
@@ -204,8 +203,9 @@ def test_a_withheld_power_is_a_reason_with_the_ids_of_meters(site: Site) -> None
     """Readings of voltages alone: undecided, and the sentence names the setting."""
     watcher = design(site)
     state, whole = watcher.init(T - 1.0), tick(site)
-    readings = tuple(r and msgspec.structs.replace(r, p_kw=math.nan) for r in whole.readings)
-    bare = replace(whole, readings=readings, silent=())
+    values = whole.values.copy()
+    values[P_KW, :-1] = np.nan
+    bare = replace(whole, values=values, silent=())
     _, estimate, verdict = watcher.step(state, to_frame(site, snapshot(site, bare)))
     verdict = replace(verdict, decision=Decision.UNDECIDED, cause=Cause.MISSING_POWERS)
     if "unread_std_percent" not in verdict.reason:
@@ -295,7 +295,7 @@ def test_a_wrong_inverter_and_a_lying_meter_of_a_real_feeder(site: Site) -> None
     state, report = finished.init(T), None
     for sample in simulate(site, scenario):
         heard = {r.meter: r for r in sample.readings}
-        now = Tick(sample.t, tuple(heard[m] for m in site.meter_ids), heard[""], ())  # type: ignore[arg-type]
+        now = tick_of(sample.t, tuple(heard[m] for m in site.meter_ids), heard[""], ())  # type: ignore[arg-type]
         state, estimate, verdict = finished.step(state, to_frame(site, snapshot(site, now)))
         report = build(site, now, 1, estimate, verdict)
     assert isinstance(report, FeederReport)

@@ -17,12 +17,12 @@ from benchmarks.mesh import baran_wu
 from feeders.model.site import Site as FeederSite
 from feeders.model.site import from_tables, load, names
 from gridsec.interface import Cause, Decision
-from service.ingest.align import Tick
 from service.report.feeder_info import detail
 from service.report.report import BusbarMeterState, BusState, blind
 from tests.feeders import stations
 from tests.service.asking import T0
 from tests.service.looking import DESKTOP, PHONE, Site, customer
+from tests.service.ticks import tick_of
 
 pytestmark = pytest.mark.browser
 
@@ -448,7 +448,7 @@ def test_two_nominal_voltages_have_one_scale(site_of: Callable[..., Site], villa
     two = from_tables(stations.tables())
     parts = {"dairy": 0.96, "a1-east": 0.96, "quarry": 1.12, "b1-east": 1.12, "b2-west": 0.88}
     nothing = [None] * two.meters.size
-    report = blind(two, Tick(T0, tuple(nothing), None, ()), 1, Cause.AGREEMENT, "made up")
+    report = blind(two, tick_of(T0, tuple(nothing), None, ()), 1, Cause.AGREEMENT, "made up")
     nominal = two.customer_nominal[two.meters]
     meters = tuple(
         replace(

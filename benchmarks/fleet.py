@@ -1,0 +1,480 @@
+"""Cost of many feeders in one process: time by stage, rates of decoding, meters held at one reading a second.
+
+    python -m benchmarks.fleet [SECONDS] [MOST] [OTHER_TREE] [--costs]
+
+Feeders are copies of the Kerber suburban network, 146 meters and the busbar each. All ratios are of one run.
+
+1. Stages: an engine without zenoh takes calm ticks of four feeders, as single JSON readings and as batches in
+   Arrow, CBOR and JSON. Processor time of each stage, as a multiple of the estimator's step.
+2. Rates: single messages per second of a raw zenoh subscriber in Python, and of one with decoding and
+   alignment; readings per second of decoding and alignment of batches.
+3. Fleet: the service is a process of its own, this one publishes each meter once a second for SECONDS. The
+   number of feeders grows by half from 8 until a tick is late, a payload is lost or a feeder is shed, or
+   until MOST feeders. The last number that is held is printed. With --costs this part is left out.
+   With another source tree only the processor time of the service for a reading is compared, with 8 feeders.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cbor2
+import pyarrow as pa
+import zenoh
+from pyarrow import ipc
+
+from benchmarks._arguments import arguments
+from benchmarks.overload import free_ports, metrics, running
+from feeders.format.tables import write
+from feeders.model.site import Site, from_tables, load
+from feeders.registry import DesignedEstimator
+from feeders.simulation.plant import BUSBAR
+from feeders.simulation.scenario import Scenario, SimulatedReading, simulate
+from service.cli.simulate import key_of
+from service.engine import feeder_monitor
+from service.engine.engine import Engine, RuntimeConfig
+from service.engine.feeder_monitor import design, known_of
+from service.ingest.align import Aligner, rules
+from service.ingest.queues import BusConfig, BusCounts, Sample, Value
+from service.ingest.reading import Wire
+from service.ingest.zenoh_bus import Bus, MeterClient, session
+from service.report.tick_state import TickState
+from service.store import Store
+from service.store.committer import Committer
+
+FEEDER = "kerber-vorstadtnetz"
+FORMATS = {
+    "json": "application/json",
+    "arrow": "application/vnd.apache.arrow.stream",
+    "cbor": "application/cbor",
+    "json-batch": "application/json",
+}
+"""Encoding by name; `json` stands for single readings."""
+COPIES = 4
+WARM, TICKS = 20, 100
+"""Ticks before the measurement, and measured ones."""
+SENT = 60_000
+"""Messages of the rates of zenoh."""
+SPREAD = 60
+"""Feeders that these messages belong to."""
+SIMULATED = 60
+LATE_S = 1.0
+"""Age of a tick's result, s, from which it is late."""
+FIRST, GROWTH = 8, 1.5
+
+Put = tuple[str, bytes, str]
+
+
+class Nowhere:
+    """Publisher without a receiver."""
+
+    failure: str | None = None
+
+    def __init__(self) -> None:
+        self.counts = BusCounts()
+
+    def telemetry(self, key: str, payload: Value) -> None:
+        """Build nothing."""
+
+    def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
+        """Confirm at once."""
+        self.counts.published += bool(key and payload is not None) + last
+        if done is not None:
+            done()
+        return True
+
+    def answer(self, key: str, payload: bytes) -> None:
+        """Keep nothing."""
+
+    def withdraw(self, key: str) -> None:
+        """Change nothing."""
+
+
+def single(reading: SimulatedReading, t: float) -> bytes:
+    """Return a reading as JSON."""
+    fields = {"t": t, "v_volt": reading.v_volt}
+    return json.dumps(fields if reading.p_kw is None else fields | {"p_kw": reading.p_kw}).encode()
+
+
+def batch(readings: Sequence[SimulatedReading], t: Sequence[float], form: str) -> bytes:
+    """Return readings of meters as one payload."""
+    columns = {
+        "meter": [one.meter for one in readings],
+        "t": list(t),
+        "v_volt": [one.v_volt for one in readings],
+        "p_kw": [one.p_kw for one in readings],
+    }
+    if form == "cbor":
+        return cbor2.dumps(columns)
+    if form == "json-batch":
+        return json.dumps(
+            [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        ).encode()
+    table = pa.record_batch(columns)
+    sink = pa.BufferOutputStream()
+    with ipc.new_stream(sink, table.schema) as writer:
+        writer.write_batch(table)
+    return bytes(sink.getvalue().to_pybytes())
+
+
+def puts(name: str, readings: Sequence[SimulatedReading], t: float, form: str) -> list[Put]:
+    """Return all puts of a feeder at one second."""
+    if form == "json":
+        return [(f"gridsec/{key_of(name, one.meter)}", single(one, t), FORMATS[form]) for one in readings]
+    meters = [one for one in readings if one.meter != BUSBAR]
+    busbar = next(one for one in readings if one.meter == BUSBAR)
+    payload = batch(meters, [t] * len(meters), form)
+    key = f"gridsec/{name}/concentrator/c1/readings"
+    busbar_key = f"gridsec/{key_of(name, BUSBAR)}"
+    return [(key, payload, FORMATS[form]), (busbar_key, single(busbar, t), FORMATS["json"])]
+
+
+def copies(site: Site, names: Sequence[str]) -> list[Site]:
+    """Return copies of a feeder with other names."""
+    return [from_tables(replace(site.tables, meta=replace(site.tables.meta, name=name))) for name in names]
+
+
+# --- Stages ---
+
+
+STAGES: dict[str, tuple[Any, str]] = {
+    "step": (DesignedEstimator, "step"),
+    "frame": (feeder_monitor, "to_frame"),
+    "decode": (Wire, "gather"),
+    "align": (Aligner, "take_all"),
+    "due": (Engine, "_reach"),
+    "conditions": (TickState, "notable"),
+    "history": (Engine, "_history"),
+    "keep_states": (Engine, "keep_states"),
+    "commit": (Committer, "commit"),
+    "cycle": (Engine, "cycle"),
+}
+"""Function of each stage; `cycle` contains all of them."""
+
+
+@contextmanager
+def timed() -> Iterator[Counter[str]]:
+    """Add up the processor time of each stage, s."""
+    spent: Counter[str] = Counter()
+
+    def watch(name: str, run: Callable[..., Any]) -> Callable[..., Any]:
+        def measured(*given: Any, **named: Any) -> Any:
+            begun = time.thread_time()
+            try:
+                return run(*given, **named)
+            finally:
+                spent[name] += time.thread_time() - begun  # type: ignore[assignment]
+
+        return measured
+
+    kept = {name: getattr(owner, function) for name, (owner, function) in STAGES.items()}
+    for name, (owner, function) in STAGES.items():
+        setattr(owner, function, watch(name, kept[name]))
+    try:
+        yield spent
+    finally:
+        for name, (owner, function) in STAGES.items():
+            setattr(owner, function, kept[name])
+
+
+def stages(site: Site, form: str) -> dict[str, float]:
+    """Return the time of each stage for one calm tick of one feeder, s."""
+    names = [f"f{k}" for k in range(COPIES)]
+    seconds = list(simulate(site, Scenario(seed=1, duration_s=float(WARM + TICKS), dt_s=1.0)))
+    now = seconds[0].t
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Store(f"sqlite:///{folder}/f.db") as store,
+        timed() as spent,
+    ):
+        engine = Engine(RuntimeConfig(), store, copies(site, names), wall=lambda: now, stored=lambda: None)
+        engine.committer.publisher = Nowhere()
+        for monitor in engine.monitors.values():
+            monitor.install(design(monitor.site))
+        engine.begin()
+        for number, second in enumerate(seconds):
+            if number == WARM:
+                spent.clear()
+            now = second.t + 0.05
+            sent = [put for name in names for put in puts(name, second.readings, second.t, form)]
+            engine.cycle([Sample(key, payload, kind, now, len(payload)) for key, payload, kind in sent])
+    return {name: total / (TICKS * COPIES) for name, total in spent.items()}
+
+
+def print_stages(site: Site) -> float:
+    """Print the stages of all formats; return the largest cost of a tick in steps."""
+    found = {form: stages(site, form) for form in FORMATS}
+    print("Processor time of a calm tick of 146 meters, in steps of the estimator")
+    print(f"{'':12}" + "".join(f"{form:>12}" for form in found))
+    for name in STAGES:
+        print(f"{name:12}" + "".join(f"{one[name] / one['step']:12.3f}" for one in found.values()))
+    for form, one in found.items():
+        each, step = (1e6 * one[name] / (len(site.meter_ids) + 1) for name in ("cycle", "step"))
+        print(f"{form}: {each:.1f} us per reading, the step {step:.1f} us")
+    return max(one["cycle"] / one["step"] for one in found.values())
+
+
+# --- Rates ---
+
+
+def batch_rate(site: Site, form: str, scans: int) -> float:
+    """Readings per second of processor time: decoding and alignment of batches of `scans` seconds."""
+    wire, name = Wire({site.feeder.name: known_of(site)}, max_bytes=1 << 24), site.feeder.name
+    seconds = list(simulate(site, Scenario(seed=1, duration_s=8.0, dt_s=1.0)))
+    readings = [one for one in seconds[0].readings if one.meter != BUSBAR]
+    aligner = Aligner(site.meter_ids, rules(1.0, 10.0, grace_s=float(scans)))
+    number, begun = 0, seconds[0].t
+    rounds: list[list[Sample]] = []
+    for k in range(40):
+        t = [begun + scans * k + scan for scan in range(scans) for _ in readings]
+        payload = batch(readings * scans, t, form)
+        key = f"gridsec/{name}/concentrator/c1/readings"
+        rounds.append([Sample(key, payload, FORMATS[form], t[-1] + 0.05, len(payload))])
+    started = time.thread_time()
+    for samples in rounds:
+        for columns in wire.gather(samples).readings.values():
+            aligner.take_all(columns)
+            number += len(columns)
+    return number / (time.thread_time() - started)
+
+
+def zenoh_rates(site: Site) -> tuple[float, float]:
+    """Messages per second of a raw subscriber, and of the bus with decoding and alignment."""
+    names = [f"f{k}" for k in range(SPREAD)]
+    wire = Wire(dict.fromkeys(names, known_of(site)))
+    aligners = {name: Aligner(site.meter_ids, rules(1.0, 10.0)) for name in names}
+    context = multiprocessing.get_context("spawn")
+
+    def rate(receive: Callable[[str], Callable[[], int]]) -> float:
+        endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+        count = receive(endpoint)
+        sender = context.Process(target=send, args=(endpoint, names))
+        sender.start()
+        while not count():
+            time.sleep(0.001)
+        begun, end = time.monotonic(), time.monotonic() + 60.0
+        while count() < SENT and time.monotonic() < end:
+            time.sleep(0.01)
+        lasted = time.monotonic() - begun
+        sender.join()
+        return count() / lasted
+
+    return _raw_rate(rate), _bus_rate(rate, wire, aligners)
+
+
+def send(endpoint: str, names: Sequence[str]) -> None:
+    """Publish `SENT` single readings of the meters of feeders in turn, as fast as the receiver takes them."""
+    site = load(FEEDER)
+    (second,) = simulate(site, Scenario(seed=1, duration_s=1.0, dt_s=1.0))
+    sources = [(key_of(name, one.meter), one) for name in names for one in second.readings]
+    begun = time.time()
+    with MeterClient(BusConfig("client", connect=(endpoint,)), "gridsec") as meters:
+        for k in range(SENT):
+            key, one = sources[k % len(sources)]
+            meters.put(key, single(one, begun + 0.001 * (k // len(sources))))
+
+
+def _raw_rate(rate: Callable[[Callable[[str], Callable[[], int]]], float]) -> float:
+    ended, received = threading.Event(), [0]
+
+    def receive(endpoint: str) -> Callable[[], int]:
+        up = threading.Event()
+
+        def run() -> None:
+            config = BusConfig("router", listen=(endpoint,))
+            with session(config) as live:
+                subscriber = live.declare_subscriber("gridsec/**", zenoh.handlers.FifoChannel(8192))
+                up.set()
+                while not ended.is_set():
+                    raw = subscriber.handler.try_recv()
+                    if raw is None:
+                        time.sleep(0.0005)
+                        continue
+                    raw.payload.to_bytes()
+                    received[0] += 1
+
+        threading.Thread(target=run, daemon=True).start()
+        up.wait(10.0)
+        return lambda: received[0]
+
+    try:
+        return rate(receive)
+    finally:
+        ended.set()
+
+
+def _bus_rate(
+    rate: Callable[[Callable[[str], Callable[[], int]]], float], wire: Wire, aligners: Mapping[str, Aligner]
+) -> float:
+    received = [0]
+
+    def deliver(samples: list[Sample]) -> None:
+        gathered = wire.gather(samples)
+        for name, columns in gathered.readings.items():
+            aligners[name].take_all(columns)
+        received[0] += len(samples)
+
+    buses: list[Bus] = []
+
+    def receive(endpoint: str) -> Callable[[], int]:
+        config = BusConfig("router", listen=(endpoint,))
+        bus = Bus(config, "gridsec", deliver, max_payload=1 << 18, lossless=True)
+        bus.__enter__()
+        buses.append(bus)
+        return lambda: received[0]
+
+    try:
+        return rate(receive)
+    finally:
+        for bus in buses:
+            bus.__exit__()
+
+
+def print_rates(site: Site) -> tuple[float, float]:
+    """Print the rates; return that of single messages over the raw one, and the largest of batches."""
+    raw, used = zenoh_rates(site)
+    print(f"single messages: {used / raw:.2f} of a raw subscriber ({used:.0f} and {raw:.0f} messages/s)")
+    best = 0.0
+    for form in ("arrow", "cbor", "json-batch"):
+        for scans in (1, 7):
+            found = batch_rate(site, form, scans)
+            best = max(best, found)
+            size = scans * len(site.meter_ids)
+            print(f"batches of {size} in {form}: {found / 1e6:.2f} M readings per processor second")
+    return used / raw, best
+
+
+# --- Fleet ---
+
+
+class Fleet(threading.Thread):
+    """Publishes every meter of all feeders once a second, spread over the second."""
+
+    def __init__(self, site: Site, names: Sequence[str], form: str, endpoint: str) -> None:
+        super().__init__(daemon=True)
+        seconds = simulate(site, Scenario(seed=1, duration_s=float(SIMULATED), dt_s=1.0))
+        self.seconds = [second.readings for second in seconds]
+        self.names, self.form, self.endpoint = names, form, endpoint
+        self.behind_s = 0.0
+        self.ended = threading.Event()
+
+    def run(self) -> None:
+        """Publish."""
+        with MeterClient(BusConfig("client", connect=(self.endpoint,)), "gridsec") as meters:
+            second = int(time.time()) + 1
+            while not self.ended.is_set():
+                time.sleep(max(0.0, second - time.time()))
+                readings = self.seconds[second % SIMULATED]
+                for number, name in enumerate(self.names):
+                    # A feeder's meters report at once; feeders follow each other within 0.3 s.
+                    time.sleep(max(0.0, second + 0.3 * number / len(self.names) - time.time()))
+                    for key, payload, kind in puts(name, readings, float(second), self.form):
+                        meters.put(key.removeprefix("gridsec/"), payload, kind)
+                second += 1
+                self.behind_s = max(self.behind_s, time.time() - second)
+
+
+OWN = Path(__file__).parents[1]
+
+
+def spent_s(process: int) -> float:
+    """Processor time of a process and all its threads, s."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def holds(
+    site: Site, folder: Path, number: int, form: str, *, seconds: float, tree: Path = OWN
+) -> tuple[bool, float, str]:
+    """True if that many feeders are held; processor time for a reading, s; a line of figures."""
+    names = [f"feeder-{k:04d}" for k in range(number)]
+    place = folder / f"{tree.name}-{form}-{number}"
+    place.mkdir()
+    for name in names:
+        write(replace(site.tables, meta=replace(site.tables.meta, name=name)), place / name)
+    with running(tree, place, names) as service:
+        fleet = Fleet(site, names, form, service.zenoh)
+        fleet.start()
+        try:
+            time.sleep(8.0)
+            fleet.behind_s = 0.0
+            before, begun, spent = metrics(service), time.monotonic(), spent_s(service.process.pid)
+            time.sleep(seconds)
+            cost = spent_s(service.process.pid) - spent
+            after, lasted = metrics(service), time.monotonic() - begun
+        finally:
+            fleet.ended.set()
+            fleet.join(10.0)
+    more = after - before
+    clean = more["gridsec_ticks_total clean"] / (lasted * number)
+    lost = more["gridsec_samples_dropped_total"] + more["gridsec_ticks_skipped_total"]
+    delay = more["gridsec_report_delay_seconds_sum"] / max(1, more["gridsec_report_delay_seconds_count"])
+    shed = after["gridsec_feeders_shed"]
+    held = clean > 0.98 and lost == 0 and delay < LATE_S and shed == 0
+    text = f"{form} {number} feeders, {number * 147} sources: {clean:.3f} of the ticks clean, {lost:.0f} lost"
+    text += f", {shed:.0f} shed, mean delay {delay:.2f} s, sender behind by {max(0.0, fleet.behind_s):.2f} s"
+    cost /= max(1.0, more["gridsec_readings_total"])
+    return held, cost, f"{text}, {1e6 * cost:.1f} us for a reading"
+
+
+def print_against(site: Site, seconds: float, tree: Path) -> None:
+    """Print the ratio of the processor time for a reading to that of another source tree."""
+    with tempfile.TemporaryDirectory() as folder:
+        for form in ("json", "arrow"):
+            costs = []
+            for one in (tree, OWN):
+                _, cost, text = holds(site, Path(folder), FIRST, form, seconds=seconds, tree=one)
+                costs.append(cost)
+                print(f"{one}: {text}", flush=True)
+            print(
+                f"{form}: processor time for a reading, ratio to {tree}: {costs[1] / costs[0]:.2f}",
+                flush=True,
+            )
+
+
+def print_fleet(site: Site, seconds: float, most: int) -> None:
+    """Print the number of meters that one process holds."""
+    with tempfile.TemporaryDirectory() as folder:
+        for form in ("json", "arrow"):
+            best, number = 0, FIRST
+            while number <= most:
+                held, _, text = holds(site, Path(folder), number, form, seconds=seconds)
+                print(f"{'held' if held else 'not held'}: {text}", flush=True)
+                if not held:
+                    break
+                best, number = number, max(number + 1, int(number * GROWTH))
+            print(f"{form}: {best * len(site.meter_ids)} meters", flush=True)
+
+
+TICK_MAX, SINGLES_MIN, BATCHES_MIN = 3.0, 0.2, 1e5
+"""Limits: a calm tick in steps, single messages over the raw rate, readings per second of batches."""
+
+
+def main() -> int:
+    """Measure."""
+    asked = arguments(__doc__, seconds=20.0, most=200, against="", costs=False)
+    site = load(FEEDER)
+    if asked.against:
+        print_against(site, asked.seconds, Path(asked.against).resolve())
+        return 0
+    tick = print_stages(site)
+    singles, batches = print_rates(site)
+    if not asked.costs:
+        print_fleet(site, asked.seconds, asked.most)
+    return int(not (tick <= TICK_MAX and singles >= SINGLES_MIN and batches >= BATCHES_MIN))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

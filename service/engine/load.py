@@ -1,0 +1,187 @@
+"""Load of the service, and selection of the feeders that it does not monitor under lasting overload.
+
+The demand of a feeder is ``factor (c_s n + c_t / tick_s) / capacity``: seconds of a round for each second.
+n: samples offered per second. c_s: processor time of a sample. c_t: processor time of a tick. factor: that of
+everything else in a round. capacity: processor time of the rounds over their duration; other threads take the
+rest. Samples of a feeder that is not monitored are counted, so that its demand stays known.
+
+Under lasting overload whole feeders are shed until the demand of the others is `KEPT`. They return as
+soon as the demand of all fits again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+WINDOW_S = 1.0
+"""Time between two decisions, s."""
+OVERLOADED = 0.9
+"""Demand from which a window with losses or late rounds is one of overload."""
+KEPT = 0.7
+"""Demand of the monitored feeders under overload: the rest is for the receiving thread and HTTP."""
+LASTING = 3
+"""Consecutive windows of overload before feeders are shed."""
+LONG_ROUND_S = 0.5
+"""Duration of a round, s, that is a sign of overload: ticks of 1 s are late by half a tick."""
+HOLD_S, HOLD_MAX_S = 1.0, 8.0
+"""First and longest time from an overload to the return of feeders, s; it doubles at each new overload."""
+CALM_S = 60.0
+"""Time without overload after which the first hold applies again, s."""
+FLOOD = 2.0
+"""Samples of each meter and tick from which a feeder is shed before all others."""
+CAPACITY_MIN = 0.1
+"""Smallest capacity: a process that gets less cannot be helped by fewer feeders."""
+_SMOOTH = 0.3
+"""Weight of a new window in the mean costs."""
+
+
+@dataclass(slots=True)
+class FeederLoad:
+    """Load of one feeder."""
+
+    tick_s: float  # interval of its ticks, s
+    sources: int  # number of its meters, the busbar meter included
+    standing: bool = False  # it has active alarms
+    spent_s: float = 0.0  # processor time of its ticks in this window, s
+    ticks: int = 0  # its ticks in this window
+    tick_cost_s: float = 0.0  # mean time of a tick, s
+    offered: int = 0  # number of samples until this window
+    rate: float = 0.0  # samples offered per second
+
+
+@dataclass(slots=True)
+class Window:
+    """Sums of the present window."""
+
+    begun: float
+    lasted_s: float = 0.0  # duration of all rounds, s
+    rounds_s: float = 0.0  # processor time of all rounds, s
+    placed_s: float = 0.0  # that of decoding and alignment, s
+    judged_s: float = 0.0  # that of ticks, s
+    samples: int = 0  # processed samples
+    signs: int = 0  # lost samples, skipped ticks and long rounds
+
+
+@dataclass
+class LoadControl:
+    """Selection of the feeders that are not monitored.
+
+    clock: monotonic time, s.
+    feeders: load of each feeder, by its name.
+    shed: feeders that are not monitored, in the order of the decisions.
+    """
+
+    clock: Callable[[], float]
+    feeders: dict[str, FeederLoad] = field(default_factory=dict)
+    shed: dict[str, float] = field(default_factory=dict)
+    _window: Window | None = None
+    _sample_cost_s: float = 0.0
+    _factor: float = 1.0
+    _capacity: float = 1.0
+    _overloaded: int = 0
+    _hold_s: float = HOLD_S
+    _last: float | None = None
+
+    def count_round(
+        self, lasted_s: float, rounds_s: float, placed_s: float, judged_s: float, samples: int
+    ) -> None:
+        """Add the times of a round as in `Window`, s, and the number of its samples."""
+        window = self._now()
+        window.lasted_s += lasted_s
+        window.rounds_s += rounds_s
+        window.placed_s += placed_s
+        window.judged_s += judged_s
+        window.samples += samples
+        window.signs += lasted_s > LONG_ROUND_S
+
+    def count_tick(self, feeder: str, spent_s: float) -> None:
+        """Add the processor time of a tick, s."""
+        load = self.feeders[feeder]
+        load.spent_s += spent_s
+        load.ticks += 1
+
+    def count_losses(self, number: int) -> None:
+        """Add samples or ticks that are lost by overload."""
+        self._now().signs += number
+
+    def _now(self) -> Window:
+        if self._window is None:
+            self._window = Window(self.clock())
+        return self._window
+
+    def demand(self, feeder: str) -> float:
+        """Return the demand of a feeder."""
+        load = self.feeders[feeder]
+        cost = self._sample_cost_s * load.rate + load.tick_cost_s / load.tick_s
+        return self._factor * cost / self._capacity
+
+    def update(self, offered: Mapping[str, int]) -> bool:
+        """Decide at the end of a window; return True if `shed` has changed.
+
+        `offered` is the number of samples of each feeder so far.
+        """
+        window, now = self._now(), self.clock()
+        elapsed = now - window.begun
+        if elapsed < WINDOW_S:
+            return False
+        self._measure(window, elapsed, offered)
+        self._window = Window(now)
+        before = set(self.shed)
+        for name in before - self.feeders.keys():
+            del self.shed[name]
+        kept = sum(self.demand(name) for name in self.feeders if name not in self.shed)
+        heavy = window.signs > 0 and max(kept, window.lasted_s / elapsed) > OVERLOADED
+        self._overloaded = self._overloaded + 1 if heavy else 0
+        if heavy:
+            if self._last is not None and now - self._last < CALM_S and not self.shed:
+                self._hold_s = min(HOLD_MAX_S, 2.0 * self._hold_s)
+            self._last = now
+            if self._overloaded >= LASTING:
+                self._shed_more(kept, now)
+        elif self.shed and self._last is not None and now - self._last >= self._hold_s:
+            self._take_back(kept)
+        if self._last is not None and now - self._last > CALM_S:
+            self._hold_s = HOLD_S
+        return set(self.shed) != before
+
+    def _measure(self, window: Window, elapsed: float, offered: Mapping[str, int]) -> None:
+        if window.samples:
+            cost = window.placed_s / window.samples
+            self._sample_cost_s += (_SMOOTH if self._sample_cost_s else 1.0) * (cost - self._sample_cost_s)
+        if window.lasted_s > 0.0:
+            capacity = min(1.0, max(CAPACITY_MIN, window.rounds_s / window.lasted_s))
+            self._capacity += _SMOOTH * (capacity - self._capacity)
+        spent = window.placed_s + window.judged_s
+        if spent > 0.0:
+            self._factor = min(2.0, max(1.0, window.rounds_s / spent))
+        for name, load in self.feeders.items():
+            number = offered.get(name, load.offered)
+            load.rate, load.offered = max(0, number - load.offered) / elapsed, number
+            if load.ticks and name not in self.shed:
+                cost = load.spent_s / load.ticks
+                load.tick_cost_s += (_SMOOTH if load.tick_cost_s else 1.0) * (cost - load.tick_cost_s)
+            load.spent_s, load.ticks = 0.0, 0
+
+    def _shed_more(self, kept: float, now: float) -> None:
+        """Shed feeders: floods first, feeders with active alarms last. At least one stays."""
+
+        def order(name: str) -> tuple[bool, bool, str]:
+            load = self.feeders[name]
+            flood = load.rate * load.tick_s > FLOOD * load.sources
+            return not flood, load.standing, name
+
+        monitored = sorted((name for name in self.feeders if name not in self.shed), key=order)
+        for name in monitored[:-1]:
+            if kept <= KEPT:
+                return
+            kept -= self.demand(name)
+            self.shed[name] = now
+
+    def _take_back(self, kept: float) -> None:
+        """Monitor feeders again while their demand fits."""
+        for name in list(self.shed):
+            kept += self.demand(name)
+            if kept > KEPT:
+                return
+            del self.shed[name]

@@ -1,0 +1,261 @@
+"""Result of one tick of a feeder, from which its report is built on request.
+
+A calm tick needs no report: nothing is stored or published of it unless it is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from feeders.model.site import Site, volts
+from gridsec.arrays import Bools, Floats
+from gridsec.interface import Cause, Decision, Estimate, Verdict
+from service.ingest.align import Tick
+from service.report.report import (
+    BUSBAR,
+    DataErrorReport,
+    DisplayedVerdict,
+    FeederReport,
+    LearningReport,
+    ReferenceVoltages,
+    Silence,
+    blind,
+    build,
+    busbar_report,
+    explanations,
+    finite,
+    grounds,
+    in_words,
+    inverter_states,
+    meter_states,
+    reason_of,
+    std_volts,
+    to_text,
+    with_data_error,
+    with_learning,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class TickState:
+    """Result of one tick. It is immutable: any thread may build its report."""
+
+    site: Site
+    tick: Tick
+    max_attacked: int  # M of the design
+    cause: Cause
+    # Reason at a tick without a monitor; empty: that of the judgement.
+    reason: str = ""
+    # estimate, judgement: output of the estimator; None at a tick without a monitor.
+    estimate: Estimate | None = None
+    judgement: Verdict | None = None
+    learning: LearningReport | None = None  # learning of the meters; None at a tick without a monitor
+    data_error: DataErrorReport | None = None  # error of the files that explains accused meters
+    # revision, t_measured, since: as in `FeederReport`.
+    revision: str = ""
+    t_measured: float | None = None
+    since: float | None = None
+    # Newest tick with the displayed verdict, and the start of the time that led to it, Unix s.
+    displayed: tuple[TickState, float] | None = None
+
+    @property
+    def skipped(self) -> int:
+        """Number of skipped ticks directly before."""
+        return self.tick.skipped
+
+    @property
+    def feeder(self) -> str:
+        """Name of the feeder."""
+        return self.site.feeder.name
+
+    @property
+    def t(self) -> float:
+        """Unix time of the tick, s."""
+        return self.tick.t
+
+    @property
+    def verdict(self) -> Decision:
+        """Verdict."""
+        return Decision.UNDECIDED if self.judgement is None else self.judgement.decision
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        """Meters that the verdict names as manipulated, as in `FeederReport`."""
+        if self.judgement is None:
+            return ()
+        named = tuple(self.site.meter_ids[k] for k in np.flatnonzero(self.judgement.suspects))
+        return (*named, BUSBAR) if self.judgement.busbar.any() else named
+
+    @property
+    def inverters(self) -> int:
+        """Number of inverters that the verdict names as manipulated."""
+        judgement = self.judgement
+        if judgement is None or not judgement.inverters.size:
+            return 0
+        judged = ~judgement.unjudged if judgement.unjudged.size else True
+        return int(np.count_nonzero(judgement.inverters & judged))
+
+    @property
+    def model_only(self) -> bool:
+        """True if no value uses a voltage reading of this tick."""
+        return not self.grounds.measured.any()
+
+    def summary(self) -> dict[str, Any]:
+        """Return the numbers of the list of feeders."""
+        shown = self.displayed
+        return {
+            "t": self.t,
+            "verdict": self.verdict,
+            "model_only": self.model_only,
+            "since": self.since,
+            "displayed_verdict": None if shown is None else shown[0].verdict,
+            "displayed_since": None if shown is None else shown[1],
+            "meters": len(self.site.meter_ids),
+            "suspects": len(self.suspects) + self.inverters,
+            "silent": sum(meter is not None for meter, _ in self.tick.silent),
+        }
+
+    @cached_property
+    def grounds(self) -> ReferenceVoltages:
+        """Readings that the values use."""
+        return grounds(self.site, self.tick, self.estimate, self.judgement)
+
+    @cached_property
+    def report(self) -> FeederReport:
+        """The report."""
+        if self.estimate is None or self.judgement is None:
+            report = blind(self.site, self.tick, self.max_attacked, self.cause, self.reason)
+        else:
+            report = build(self.site, self.tick, self.max_attacked, self.estimate, self.judgement)
+            report = with_data_error(report, self.data_error)
+            report = report if self.learning is None else with_learning(report, self.learning)
+        report = replace(report, revision=self.revision, t_measured=self.t_measured, since=self.since)
+        if self.displayed is None:
+            return report
+        tick, since = self.displayed
+        return replace(report, displayed=_shown(report if tick.t == self.t else tick.report, since))
+
+    def text(self) -> bytes:
+        """Return the report as JSON text."""
+        return to_text(self.report)
+
+    def notable(self, subjects: Collection[str | None]) -> FeederReport | None:
+        """Return the part of the report that conditions depend on; None if none can be present.
+
+        An unknown condition has an effect only if an alarm, or a pending one, has its subject. `subjects` are
+        these: meters, customers of inverters and `BUSBAR`; None for the feeder. All other meters and
+        inverters without a condition, the buses and the customers are left out.
+        """
+        learning, tick, judgement = self.learning, self.tick, self.judgement
+        if learning is not None and learning.stalled:
+            return self.report
+        meters, inverters = self._notable_meters(subjects), self._notable_inverters(subjects)
+        busbar = BUSBAR in subjects or tick.busbar_offset is not None
+        busbar = busbar or (judgement is not None and bool(judgement.busbar.any()))
+        decided = self.verdict is not Decision.UNDECIDED
+        nothing = not (meters.any() or inverters.any() or tick.silent or busbar)
+        if nothing and decided and learning is not None:
+            return None
+        report = replace(
+            self._part(meters),
+            reason="" if decided else self._reason(),
+            inverters=inverter_states(
+                self.site, self.estimate, judgement, self.grounds.model_only(self.site), inverters
+            ),
+            explanations=() if judgement is None else explanations(self.site, judgement),
+            learning=learning,
+        )
+        return with_data_error(report, self.data_error)
+
+    def kept(self) -> FeederReport:
+        """Return the part of the report that the history keeps: the meters and the busbar meter."""
+        return self._part(None)
+
+    def _part(self, which: Bools | None) -> FeederReport:
+        """Report of the feeder with its busbar meter and some meters, (p,), or all."""
+        site, tick = self.site, self.tick
+        limits, nominal = site.tables.meta.limits, site.tables.meta.voltage_volt
+        return FeederReport(
+            feeder=self.feeder,
+            t=self.t,
+            verdict=self.verdict,
+            reason="",
+            cause=self.cause,
+            max_attacked=self.max_attacked,
+            meters=meter_states(
+                site,
+                tick,
+                self.estimate,
+                self.judgement,
+                volts_of=self._volts,
+                model_only=self.grounds.model_only(site),
+                which=which,
+            ),
+            buses=(),
+            silent=tuple(Silence(BUSBAR if meter is None else meter, finite(s)) for meter, s in tick.silent),
+            v_min_volt=limits.v_min_pu * nominal,
+            v_max_volt=limits.v_max_pu * nominal,
+            busbar=busbar_report(site, tick, self.estimate, self.judgement),
+        )
+
+    def _reason(self) -> str:
+        """Reason of the verdict, with skipped ticks."""
+        if self.judgement is None:
+            return in_words(self.reason, self.tick)
+        return in_words(reason_of(self.site, self.tick, self.max_attacked, self.judgement), self.tick)
+
+    @cached_property
+    def _volts(self) -> tuple[Floats, Floats]:
+        """Voltage of every customer and its standard deviation, V, (N,)."""
+        if self.estimate is None:
+            unknown = np.full(len(self.site.feeder.customers), np.nan)
+            return unknown, unknown
+        return volts(self.site.customer_volt, self.estimate.v2), std_volts(self.site, self.estimate)
+
+    def _notable_meters(self, subjects: Collection[str | None]) -> Bools:
+        """Meters that a condition may depend on, (p,)."""
+        site, judgement = self.site, self.judgement
+        which = np.zeros(site.meters.size, dtype=np.bool_)
+        if self.tick.silent:
+            return ~which  # the share of the silent meters is a condition, too
+        if subjects:
+            which |= np.array([meter in subjects for meter in site.meter_ids], dtype=np.bool_)
+        if self.tick.clock_offset:
+            which |= np.array([offset is not None for offset in self.tick.clock_offset])
+        if judgement is None:
+            return which
+        v, limits, nominal = self._volts[0][site.meters], site.tables.meta.limits, site.customer_nominal
+        low, high = limits.v_min_pu * nominal[site.meters], limits.v_max_pu * nominal[site.meters]
+        which |= judgement.suspects | (v < low) | (v > high)
+        if judgement.decision is Decision.UNDECIDED:
+            which |= ~self.tick.seen
+        return which
+
+    def _notable_inverters(self, subjects: Collection[str | None]) -> Bools:
+        """Inverters that a condition may depend on, (m,)."""
+        customers = self.site.droop.customer
+        which = np.zeros(customers.size, dtype=np.bool_)
+        if subjects and customers.size:
+            names = self.site.tables.customers
+            which |= np.array([names[k].customer in subjects for k in customers.tolist()], dtype=np.bool_)
+        if self.judgement is not None and self.judgement.inverters.size:
+            which |= self.judgement.inverters
+        return which
+
+
+def _shown(report: FeederReport, since: float) -> DisplayedVerdict:
+    """Displayed verdict of the newest report that has it; since: start of the time that led to it, Unix s."""
+    return DisplayedVerdict(
+        verdict=report.verdict,
+        since=since,
+        t=report.t,
+        cause=report.cause,
+        reason=report.reason,
+        suspects=report.suspects,
+        inverters=tuple(inverter.customer for inverter in report.inverters if inverter.suspect),
+    )

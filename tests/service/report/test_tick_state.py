@@ -1,0 +1,72 @@
+"""The part of a report that conditions depend on gives the alarms of the whole report."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from feeders.model.site import Site, load
+from feeders.simulation.attacks import Bias
+from feeders.simulation.scenario import Scenario, SimulatedReading, by_arrival, simulate
+from gridsec.interface import Decision
+from service.alarms.conditions import conditions
+from service.alarms.state_machine import AlarmBook, AlarmRules, AlarmTransition, advance
+from service.engine.feeder_monitor import TickResult
+from service.engine.replay import ReplayCounts, replay
+from tests.service.liars import FEEDER, START
+
+
+@pytest.fixture(scope="module")
+def site() -> Site:
+    return load(FEEDER)
+
+
+def results(site: Site, gone: dict[str, tuple[float, float]], **more: Any) -> list[TickResult]:
+    """Replay a scenario in which meters are unheard of for a while."""
+
+    def heard(one: SimulatedReading) -> bool:
+        first, last = gone.get(one.meter, (1.0, 0.0))
+        return not first <= one.t - START < last
+
+    scenario = Scenario(seed=3, start=START, duration_s=60.0, **more)
+    readings = [one for one in by_arrival(simulate(site, scenario)) if heard(one)]
+    return list(replay(site, readings, ReplayCounts()))
+
+
+@pytest.mark.parametrize("scene", ["calm", "liar", "silent", "low"])
+def test_alarms_are_those_of_whole_reports(site: Site, scene: str) -> None:
+    gone: dict[str, tuple[float, float]] = {}
+    more: dict[str, Any] = {}
+    if scene == "liar":
+        more["attacks"] = (Bias(np.array([2]), START + 15.0, START + 40.0, np.array([0.06])),)
+    if scene == "silent":
+        gone = {site.meter_ids[1]: (20.0, 45.0), site.meter_ids[4]: (10.0, 12.0), "": (30.0, 33.0)}
+    if scene == "low":
+        limits = replace(site.tables.meta.limits, v_min_pu=1.06, v_max_pu=1.2)
+        tables = replace(site.tables, meta=replace(site.tables.meta, limits=limits))
+        site = replace(site, tables=tables)
+    found = results(site, gone, **more)
+    rules = AlarmRules(2.0, 5.0, silence_s=10.0)
+    whole, part = AlarmBook(FEEDER), AlarmBook(FEEDER)
+    told: list[AlarmTransition] = []
+    calm = 0
+    for result in found:
+        state = result.state
+        notable = state.notable({subject for _, subject in part.entries})
+        calm += notable is None
+        some = [] if notable is None else conditions(notable)
+        whole, expected = advance(whole, rules, conditions(state.report), state.t)
+        part, transitions = advance(part, rules, some, state.t)
+        assert transitions == expected
+        assert part == whole
+        assert state.suspects == state.report.suspects
+        assert state.inverters == sum(one.suspect for one in state.report.inverters)
+        assert state.model_only == state.report.model_only
+        assert (state.verdict, state.cause) == (state.report.verdict, state.report.cause)
+        told += transitions
+    assert bool(told) == (scene != "calm")
+    assert calm > 10 or scene != "calm"
+    assert Decision.CLEAN in {result.state.verdict for result in found}
