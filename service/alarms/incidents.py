@@ -258,7 +258,7 @@ class Shelf:
         None
     )
     ended_by: Annotated[
-        str | None, Field(description="Operator who ended it; null for its time or a higher severity.")
+        str | None, Field(description="Operator of its early end; null for its time or a higher severity.")
     ] = None
     escalated: Annotated[bool, Field(description="An alarm of a higher severity has ended it.")] = False
 
@@ -276,7 +276,7 @@ class PlannedWork:
     t: Annotated[float, Field(description="Time of the entry.")]
     begun: bool = False
     t_ended: Annotated[float | None, Field(description="Time of the actual end; null before it.")] = None
-    ended_by: Annotated[str | None, Field(description="Operator who ended it early.")] = None
+    ended_by: Annotated[str | None, Field(description="Operator of its early end; null without one.")] = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from gridsec.errors import GridsecError
 from service.alarms.conditions import AlarmKind, Severity
@@ -40,11 +40,9 @@ from service.alarms.state_machine import (
     ulid,
     unacknowledged,
 )
-from service.store.committer import Wish
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
-    from service.store import Store
+from service.engine.feeder_monitor import FeederMonitor
+from service.store import Store
+from service.store.committer import Committer, Wish
 
 SHELVE_MOST_S = 86_400.0
 """Default of the longest time of a shelf, s: one day."""
@@ -73,6 +71,17 @@ class ShelfRequest:
     reason: str
 
 
+class Rounds(Protocol):
+    """Part of the engine that actions of operators use."""
+
+    store: Store
+    committer: Committer
+    monitors: dict[str, FeederMonitor]
+
+    def carry_over(self, alarm: Alarm) -> None:
+        """Copy a stored acknowledgement, or its withdrawal, to the book and to later results."""
+
+
 class Operators:
     """Actions of operators.
 
@@ -81,7 +90,7 @@ class Operators:
     shelve_most_s: longest time of a shelf, s.
     """
 
-    def __init__(self, engine: Engine, wall: Callable[[], float], shelve_most_s: float) -> None:
+    def __init__(self, engine: Rounds, wall: Callable[[], float], shelve_most_s: float) -> None:
         self._engine, self._wall, self.shelve_most_s = engine, wall, shelve_most_s
 
     # ---------------------------------------------------------------------- alarms

@@ -262,8 +262,8 @@ class WriteJob:
     """One write: data, published events, and the next part of the outbox."""
 
     key: int
-    now: float  # wall clock, Unix s
     batch: Batch
+    now: float = 0.0  # wall clock, Unix s
     published: tuple[int, ...] = ()
     probe: bool = False
     page_after: int | None = None
@@ -406,8 +406,8 @@ class Committer:
         more = self._outbox_after is not None and len(self._unpublished) < OUTBOX_PAGE
         return WriteJob(
             next(self._keys),
-            self._wall(),
             self.waiting.take(),
+            self._wall(),
             tuple(self._published),
             probe=self.problem is not None,
             page_after=self._outbox_after if more else None,

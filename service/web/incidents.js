@@ -24,12 +24,13 @@ const ACTIONS = {
   unack: { title: "Withdraw acknowledgement", verb: "Withdraw", key: "u", text: "Comment", path: "unack" },
   comment: { title: "Comment", verb: "Add comment", key: "c", text: "Comment", needed: true, path: "comment" },
   assign: { title: "Assign incident", verb: "Assign", key: "g", text: "Comment", path: "assign", to: true },
-  shelve: { title: "Shelve incident", verb: "Shelve", key: "s", text: "Reason", needed: true, duration: true },
+  shelve: { title: "Shelve alarms", verb: "Shelve", key: "s", text: "Reason", needed: true, duration: true },
   work: { title: "Planned work", verb: "Enter", text: "Reason", needed: true, times: true },
 };
 const HOURS = [1, 4, 8, 24, 72, 168];
 const PAGE = 50;
 const ALARMS_SHOWN = 100;
+const METERS_LISTED = 20; // Largest number of meters in the choice of a shelf.
 const EVERY_MS = 5000;
 const SOON_MS = 200;
 
@@ -60,7 +61,7 @@ export class Incidents {
     this.soon = null;
     this.most = 86400;
     this.asking = null;
-    for (const id of ["incident-state", "incident-kind", "incident-severity", "incident-scope", "incident-sort"]) byId(id).addEventListener("change", () => this.reload());
+    for (const id of ["incident-state", "incident-kind", "incident-severity", "incident-since", "incident-scope", "incident-sort"]) byId(id).addEventListener("change", () => this.reload());
     byId("incident-text").addEventListener("input", () => this.later());
     byId("incident-more").addEventListener("click", () => { this.limit += PAGE; this.reload(); });
     byId("incident-list").addEventListener("keydown", (event) => this.key(event));
@@ -89,6 +90,8 @@ export class Incidents {
     for (const value of { open: ["raised", "acknowledged"], todo: ["raised"], all: [] }[state]) query.append("state", value);
     if (state === "todo") for (const name of ["shelved", "planned"]) query.set(name, "false");
     for (const name of ["kind", "severity"]) if (byId(`incident-${name}`).value) query.set(name, byId(`incident-${name}`).value);
+    const hours = Number(byId("incident-since").value);
+    if (hours) query.set("since", Date.now() / 1000 - hours * 3600);
     if (byId("incident-scope").value === "this" && this.feeder) query.set("feeder", this.feeder);
     const text = byId("incident-text").value.trim();
     if (text) query.set("text", text);
@@ -203,9 +206,11 @@ export class Incidents {
       events.length ? el("ol", { class: "log", "aria-label": "Log of the incident" }, ...events.map((event) => this.logged(event))) : null);
   }
 
-  logged({ t, change, who, comment, incident }) {
+  logged(event) {
+    const { t, change, comment, incident } = event;
     const to = change === "assigned" ? ` to ${incident.assigned_to ?? "none"}` : "";
-    return el("li", {}, el("time", { text: clock(t) }), ` ${CHANGE[change] ?? change}${to}${who ? ` by ${who}` : ""}`, comment ? el("q", { text: comment }) : null);
+    const by = event.who ? ` by ${event.who}` : "";
+    return el("li", {}, el("time", { text: clock(t) }), ` ${CHANGE[change] ?? change}${to}${by}`, comment ? el("q", { text: comment }) : null);
   }
 
   // Arrow keys go from incident to incident, letters act on the focused one.
@@ -244,7 +249,8 @@ export class Incidents {
     byId("act-text").required = Boolean(action.needed);
     byId("act-to-row").hidden = !action.to;
     byId("act-to").value = incident?.assigned_to ?? "";
-    byId("act-duration-row").hidden = !action.duration;
+    byId("act-duration-row").hidden = byId("act-scope-row").hidden = !action.duration;
+    if (action.duration) this.scopes(incident);
     byId("act-times").hidden = !action.times;
     for (const id of ["act-from", "act-until"]) byId(id).required = Boolean(action.times);
     const now = Date.now() / 1000;
@@ -254,6 +260,14 @@ export class Incidents {
     session.ask("act-who");
     if (action.duration) await this.durations();
     byId("act").showModal();
+  }
+
+  // Alarms that a shelf may cover: those of the incident, of one of its meters, of one of its kinds.
+  scopes({ id, feeder, meters, kinds }) {
+    const own = [["this incident", { incident: id }]];
+    for (const meter of meters.slice(0, METERS_LISTED)) own.push([`all of ${meter}`, { feeder, meter }]);
+    for (const kind of kinds) own.push([`all ${kind} of ${feeder}`, { feeder, kind }]);
+    byId("act-scope").replaceChildren(...own.map(([text, value]) => el("option", { value: JSON.stringify(value), text })));
   }
 
   async durations() {
@@ -267,7 +281,7 @@ export class Incidents {
   request() {
     const { name, incident } = this.asking;
     const text = byId("act-text").value;
-    if (name === "shelve") return [`${API}/shelves`, { incident: incident.id, duration_s: Number(byId("act-duration").value), reason: text }];
+    if (name === "shelve") return [`${API}/shelves`, { ...JSON.parse(byId("act-scope").value), duration_s: Number(byId("act-duration").value), reason: text }];
     if (name === "work") {
       const [from, until] = ["act-from", "act-until"].map((id) => new Date(byId(id).value).getTime() / 1000);
       return [`${API}/planned-work`, { feeder: this.feeder, t_from: from, t_until: until, reason: text }];

@@ -35,7 +35,16 @@ from service.access import pki
 from service.access.identity import NotAuthenticated, Role
 from service.access.keys import create
 from service.access.tokens import TokenVerifier
-from service.alarms.state_machine import AlarmRules, AlarmUnknown, acknowledged, restore
+from service.alarms.incidents import (
+    Incident,
+    IncidentBook,
+    IncidentChanged,
+    IncidentUnknown,
+    ShelfUnknown,
+    WorkUnknown,
+    advance,
+)
+from service.alarms.state_machine import AlarmRules, AlarmUnknown, acknowledged, restore, unacknowledged
 from service.api.access import FAILURES, Authenticator, authorise
 from service.cli import demo
 from service.cli.paths import check_paths, write_tables
@@ -44,6 +53,7 @@ from service.cli.sources import converted
 from service.cli.study_report import STUDIES, Asked
 from service.engine.commissioning import FeederCommissioning
 from service.engine.design_jobs import prepare
+from service.engine.operators import Operators, ShelfRequest
 from service.engine.runtime import Runtime
 from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, TooManyFeeders
 from service.ingest import zenoh_bus
@@ -306,6 +316,15 @@ def suspect_twice(_: Path, __: Patch) -> None:
     decode_distrust(site, replace(kept, text=json.dumps(record | {"meters": 2 * record["meters"]})))
 
 
+SHELF = ShelfRequest("village", None, None, "m1", None, None, 61.0, "known")
+
+
+def incident() -> Incident:
+    """The incident of one alarm."""
+    made, _ = advance(IncidentBook("village"), [raised(an_alarm(reason="reports 240.0 V"))], T0)
+    return next(iter(made.incidents.values()))
+
+
 def watcher(name: str, learner: object) -> Any:
     """A watcher that does not learn; its estimator can, or cannot."""
     return SimpleNamespace(family=SimpleNamespace(name=name, bias_learning=learner), bias_learning=None)
@@ -503,6 +522,12 @@ CALLS: dict[str, Call] = {
     "HTTP at an address of another machine": lambda _, __: app._listen("192.0.2.1:80").__enter__(),
     "alarm that does not exist": lambda _, __: refuse(AlarmUnknown("nothing")),
     "second answer to an alarm": lambda _, __: acknowledged(ANSWERED, "Grace", "", T0),
+    "withdrawal without an answer": lambda _, __: unacknowledged(ALARM, "Ada", "", T0),
+    "incident that does not exist": lambda _, __: refuse(IncidentUnknown("nothing")),
+    "answer to an earlier incident": lambda _, __: refuse(IncidentChanged(incident(), 2)),
+    "shelf that does not exist": lambda _, __: refuse(ShelfUnknown("nothing")),
+    "work that does not exist": lambda _, __: refuse(WorkUnknown("nothing")),
+    "shelf for ever": lambda _, __: Operators(cast(Any, None), lambda: T0, 60.0).shelve(SHELF, "Ada"),
     "answer to an earlier occurrence": lambda _, __: acknowledged(AGAIN, "Ada", "", T0, count=1),
     "delay before an alarm": lambda _, __: AlarmRules(on_delay_s=-1.0),
     "alarm of another feeder": lambda _, __: restore("town", [ALARM]),

@@ -330,6 +330,7 @@ def test_alarms_of_a_feeder_that_was_left_out_are_cleared_at_the_start(
         first, second = store.active(FEEDER)
         elsewhere = replace(first, id="0" * 26, feeder="elsewhere")
         store.outbox_done(store.commit([AlarmTransition(elsewhere, Change.RAISED, START)]))
+        store.incidents_published([store.last_incident_event])
         store.commit(put=("elsewhere", {"tables": "of another version, which cannot be loaded"}))
     outlet = Outlet()
     with Store(f"sqlite:///{path}") as store:

@@ -64,6 +64,7 @@ def test_one_line_for_an_attack_and_actions_by_keyboard(site: Site) -> None:
     expect(one.locator('.alarm[data-state="acknowledged"]')).to_have_count(3)
     one.get_by_role("button", name="Shelve").click()
     page.select_option("#act-duration", str(4 * 3600))
+    expect(page.locator("#act-scope option")).to_have_count(5)
     fill(page, "known")
     expect(one.locator('.note[data-kind="shelved"]')).to_contain_text("shelved until")
     expect(one).to_have_attribute("data-suppressed", "yes")
@@ -149,6 +150,9 @@ def test_a_click_survives_news_and_the_search_narrows(site: Site) -> None:
     assert page.evaluate("document.activeElement.closest('.incident').dataset.state") in {"raised", "cleared"}
     page.locator(".more summary").click()
     page.select_option("#incident-sort", "onset")
+    with page.expect_request(lambda request: "/incidents?" in request.url and "since=" in request.url):
+        page.select_option("#incident-since", "1")
+    page.select_option("#incident-since", "")
     page.fill("#incident-text", "h5")
     expect(page.locator(".incident")).to_have_count(1)
     expect(line(page)).to_contain_text("H5")
