@@ -383,7 +383,7 @@ def _operator(identity: Identity, given: str | None) -> str:
     if identity is OPEN:
         raise RequestValidationError([{"loc": ("body", "who"), "msg": "Field required", "type": "missing"}])
     if given not in {None, identity.name}:
-        raise NotPermitted(f"who must be left out: the credential is that of {identity.name}")
+        raise NotPermitted(f"`who` must be left out: the credential is that of {identity.name}")
     return identity.name
 
 
