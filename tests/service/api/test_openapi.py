@@ -68,6 +68,7 @@ def configuration() -> str:
 
 
 @pytest.mark.acceptance
+@pytest.mark.timeout(1800)
 def test_schemathesis_finds_no_failure(tmp_path: Path) -> None:
     """Every operation but the endless streams, as an admin, on a service with alarms and incidents."""
     program = shutil.which("schemathesis")
@@ -87,12 +88,12 @@ def test_schemathesis_finds_no_failure(tmp_path: Path) -> None:
         command = [
             program, "--config-file", "schemathesis.toml", "run", f"{live.http.base_url}/api/v1/openapi.json",
             "--header", f"Authorization: Bearer {text}", "--exclude-path-regex", "stream$",
-            "--phases", "examples,coverage,fuzzing", "--max-examples", "8", "--continue-on-failure",
+            "--phases", "examples,coverage,fuzzing", "--max-examples", "4", "--continue-on-failure",
             "--request-timeout", "20", "--seed", "1", "--no-color",
         ]  # fmt: skip
         environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
         done = subprocess.run(
-            command, cwd=tmp_path, capture_output=True, text=True, timeout=500, check=False, env=environment
+            command, cwd=tmp_path, capture_output=True, text=True, timeout=1500, check=False, env=environment
         )
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr
     assert re.search(r"[1-9][0-9]{2,} generated", done.stdout), done.stdout[-3000:]
