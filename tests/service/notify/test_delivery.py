@@ -393,6 +393,9 @@ def test_a_target_that_does_not_answer_delays_no_other(
             notifier.close()
             release.set()
         assert time.monotonic() - begun < 0.5
+        # The end of the service is no failure of the target.
+        time.sleep(0.2)
+        assert notifier.status()[0].failing_since is None
 
 
 def test_an_unexpected_error_ends_no_thread(
