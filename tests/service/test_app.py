@@ -114,17 +114,22 @@ def test_acknowledged_published_and_found_by_query(site: Site, tmp_path: Path) -
         run(live, site, Scenario(seed=4, start=START, duration_s=25.0, attacks=attacks))
         (alarm,) = live.alarms()
         key = f"gridsec/{FEEDER}/alarm/{alarm['id']}"
-        assert json.loads(live.meters.query(f"{FEEDER}/alarm/*", 2.0)[key]) == alarm
+        assert json.loads(live.meters.query(f"{FEEDER}/alarm/*", 2.0)[key]).items() <= alarm.items()
+        incident = f"gridsec/{FEEDER}/incident/{alarm['incident']}"
+        event = json.loads(live.meters.query(f"{FEEDER}/incident/*", 2.0)[incident])
+        assert (event["change"], event["incident"]["active"], event["notify"]) == ("opened", 1, True)
         answer = live.http.post(f"/api/v1/alarms/{alarm['id']}/ack", json={"who": "Ada", "comment": "seen"})
         assert answer.status_code == 200, answer.text
         assert (answer.json()["state"], answer.json()["acknowledged_by"]) == ("acknowledged", "Ada")
-        assert live.alarms() == [answer.json()]
+        assert live.alarms() == [alarm | answer.json()]
         until(lambda: json.loads(live.meters.query(f"{FEEDER}/alarm/*", 2.0)[key]) == answer.json())
         again = live.http.post(f"/api/v1/alarms/{alarm['id']}/ack", json={"who": "Bob"})
         assert again.status_code == 409
     with service(tmp_path, clock="events") as live:
-        assert live.alarms() == [answer.json()]
+        assert live.alarms() == [alarm | answer.json()]
         assert json.loads(live.meters.query(f"{FEEDER}/alarm/*", 2.0)[key]) == answer.json()
+        event = json.loads(live.meters.query(f"{FEEDER}/incident/*", 2.0)[incident])
+        assert (event["change"], event["who"]) == ("acknowledged", "Ada")
 
 
 BAD = {

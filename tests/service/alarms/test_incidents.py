@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gridsec.interface import Cause
 from service.alarms.incidents import (
     Assign,
     Comment,
@@ -41,9 +42,11 @@ from service.alarms.state_machine import (
     Severity,
     acknowledged,
     commented,
+    conditions,
     unacknowledged,
 )
 from tests.codes import refused
+from tests.service.reports import FEEDER, meter, report
 from tests.service.stored import T0, an_alarm, raised
 
 MANIPULATED, LOST, UNDECIDED = AlarmKind.METER_MANIPULATED, AlarmKind.DATA_LOSS, AlarmKind.UNDECIDED
@@ -310,6 +313,34 @@ def test_assignment_and_comments() -> None:
     assert only(book).assigned_to is None
     with refused(IncidentUnknown, "unknown-incident"):
         act(book, Comment("village", "X" * 26, "Bob", ""))
+
+
+# ------------------------------------------------------------ silence of a feeder
+
+
+def silent(*names: str, of: int = 5, cause: Cause = Cause.TOO_FEW_METERS) -> dict[str | None, bool]:
+    """Conditions of data loss, by meter, and whether they are known."""
+    meters = [meter(f"m{k}", seen=f"m{k}" not in names) for k in range(of)]
+    now = report(*meters, cause=cause, silent=tuple((name, 12.0) for name in names))
+    found = [one for one in conditions(now) if one.kind is LOST]
+    assert all(one.feeder == FEEDER for one in found)
+    return {one.meter: one.known for one in found}
+
+
+def test_the_silence_of_most_meters_is_one_condition() -> None:
+    assert silent("m0", "m1") == {"m0": True, "m1": True}
+    assert silent("m0", "m1", of=2) == {"m0": True, "m1": True}
+    assert silent("m0", "m1", "m2") == {None: True, "m0": False, "m1": False, "m2": False}
+    assert silent("m0", "m1", "m2", of=6) == {"m0": True, "m1": True, "m2": True}
+
+
+@pytest.mark.parametrize("connecting", [False, True])
+@pytest.mark.parametrize("cause", [Cause.AMBIGUOUS, Cause.DESIGN_INVALID, Cause.TOO_FEW_METERS])
+def test_undecided_is_unknown_while_meters_connect(connecting: bool, cause: Cause) -> None:
+    """A monitor that does not exist raises its alarm at once."""
+    now = report(meter("m0"), meter("m1", seen=False), cause=cause)
+    (found,) = [one for one in conditions(now, connecting=connecting) if one.kind is UNDECIDED]
+    assert found.known == (not connecting or cause is Cause.DESIGN_INVALID)
 
 
 # --------------------------------------------------------- any course of alarms
