@@ -65,6 +65,7 @@ def test_every_package_is_needed(bill: dict[str, Any]) -> None:
     assert names.keys() <= reached | build
 
 
+@pytest.mark.acceptance
 def test_the_same_installation_gives_the_same_file(bill: dict[str, Any]) -> None:
     dated = json.loads(made(ROOT / "requirements.lock", SOURCE_DATE_EPOCH="1795212000").stdout)
     assert dated["metadata"]["timestamp"] == "2026-11-20T22:00:00Z"

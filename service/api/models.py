@@ -296,6 +296,10 @@ class Letters(BaseModel):
     next: int | None = Field(description="`after` of the next page; null on the last one.")
 
 
+MAX_LETTER = (1 << 53) - 1
+"""Largest number of a dead letter: the largest integer that every reader of JSON represents."""
+
+
 class LetterChoice(BaseModel):
     """Choice of dead letters; without a field all of them."""
 
@@ -303,7 +307,7 @@ class LetterChoice(BaseModel):
 
     target: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]{1,64}$")] | None = None
     ids: (
-        Annotated[list[Annotated[int, Field(ge=1, le=(1 << 63) - 1)]], Field(min_length=1, max_length=1000)]
+        Annotated[list[Annotated[int, Field(ge=1, le=MAX_LETTER)]], Field(min_length=1, max_length=1000)]
         | None
     ) = None
 
@@ -380,10 +384,22 @@ class Assignment(BaseModel):
     comment: Text = ""
 
 
+def _only(*names: str) -> dict[str, Any]:
+    """Schema of an object with these of the fields that select alarms."""
+    fields = ("alarm", "incident", "feeder", *({"meter", "kind"} if "feeder" not in names else ()))
+    absent = {name: {"type": "null"} for name in sorted(fields) if name not in names}
+    return {"required": [*names], "properties": {name: {"type": "string"} for name in names} | absent}
+
+
 class Shelving(BaseModel):
     """Request of a shelf: of an `alarm`, an `incident`, or a `feeder` with a `meter`, a `kind`, or both."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "anyOf": [_only("alarm"), _only("incident"), _only("feeder", "meter"), _only("feeder", "kind")]
+        },
+    )
 
     who: Who = None
     alarm: Id | None = None

@@ -267,6 +267,29 @@ class _Web(StaticFiles):
         response.headers["Cache-Control"] = "no-cache"
         return response
 
+    async def get_response(self, path: str, scope: Any) -> Response:
+        """Return a file; 405 for a resource without the method: the page is mounted at every path."""
+        if methods := _methods(scope["app"], scope["path"]):
+            raise HTTPException(405, "Method Not Allowed", {"Allow": ", ".join(sorted(methods))})
+        return await super().get_response(path, scope)
+
+
+def _methods(app: FastAPI, path: str) -> frozenset[str]:
+    """Methods of the resource at a path; a literal path goes before one with parameters."""
+    queries: dict[tuple[str, str], frozenset[str]] = app.state.queries
+    templates = {template for template, _ in queries}
+    fitting = {path} & templates or {each for each in templates if _fits(each, path)}
+    found = {method for template, method in queries if template in fitting}
+    return frozenset(found | ({"HEAD"} if "GET" in found else set()))
+
+
+def _fits(template: str, path: str) -> bool:
+    """True if a path has the form of a template such as `/api/v1/feeders/{feeder}`."""
+    parts, given = template.split("/"), path.split("/")
+    return len(parts) == len(given) and all(
+        bool(one) if each.startswith("{") else each == one for each, one in zip(parts, given, strict=True)
+    )
+
 
 def _describe(app: FastAPI) -> None:
     """Write the OpenAPI description once, with errors as problems."""
@@ -366,8 +389,7 @@ def _operator(identity: Identity, given: str | None) -> str:
     if identity is OPEN:
         raise RequestValidationError([{"loc": ("body", "who"), "msg": "Field required", "type": "missing"}])
     if given not in {None, identity.name}:
-        text = f"must be left out: the credential is that of {identity.name}"
-        raise RequestValidationError([{"loc": ("body", "who"), "msg": text, "type": "identity"}])
+        raise NotPermitted(f"`who` must be left out: the credential is that of {identity.name}")
     return identity.name
 
 
@@ -1429,6 +1451,11 @@ def list_audit(
 
 
 async def _validation_handler(request: Request, error: Exception) -> Response:
+    methods = _methods(request.app, request.url.path)
+    if methods and request.method not in methods:
+        # The path is literal and fits a parameter of another route, such as `ack` the id of an alarm.
+        headers = {"Allow": ", ".join(sorted(methods))}
+        return problem(request, 405, "Method Not Allowed", headers=headers)
     found = cast(RequestValidationError, error).errors()
     errors = [{"where": ".".join(str(part) for part in item["loc"]), "what": item["msg"]} for item in found]
     broken = any(item["type"] == "json_invalid" for item in found)

@@ -255,6 +255,8 @@ class Delivery:
             self._pass(sent)
             self._succeeded(now)
             return
+        if response.ended:
+            return
         self._failed(response, now)
         refused = response.refused and self.position.attempts >= REFUSALS
         since = self.position.failing_since
@@ -325,6 +327,8 @@ class Delivery:
         for k in range(0, len(active), self._channel.at_once):
             part = active[k : k + self._channel.at_once]
             response = self._channel.send("", self._channel.body(part, now), now)
+            if response.ended:
+                return
             if not response.accepted:
                 self._failed(response, now, of_message=False)
                 return
@@ -342,6 +346,8 @@ class Delivery:
                 self.dead -= 1
                 self._count("resent", 1)
                 continue
+            if response.ended:
+                return
             self._count("failed", 1)
             self._store.failed_again(letter, response.problem or "")
             if not response.refused:

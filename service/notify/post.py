@@ -54,6 +54,7 @@ class Response:
     status: int | None  # status of the response; None without a response
     problem: str | None = None  # reason of a failure; None of a success
     retry_after_s: float | None = None  # wait that the target asks for, s
+    ended: bool = False  # the request was ended because the service ends: no failure of the target
 
     @property
     def accepted(self) -> bool:
@@ -103,18 +104,26 @@ def post(
         finally:
             connection.close()
     except (OSError, http.client.HTTPException, AddressRefused, ValueError) as error:
-        late = cancel.over or isinstance(error, TimeoutError)
-        return Response(None, f"no response within {endpoint.timeout_s:g} s" if late else _text(error))
+        if not (cancel.over or isinstance(error, TimeoutError)):
+            return Response(None, _text(error))
+        return _unfinished(endpoint, cancel)
     finally:
         watch.cancel()
     if cancel.over:
         # The end of the connection looks like the end of the response.
-        return Response(None, f"no response within {endpoint.timeout_s:g} s")
+        return _unfinished(endpoint, cancel)
     if 200 <= response.status < 300:
         return Response(response.status)
     start = " ".join(text.decode("utf-8", "replace").split())[:200]
     problem = f"status {response.status} {response.reason}" + (f": {start}" if start else "")
     return Response(response.status, problem, _retry_after_s(response.headers.get("Retry-After", "")))
+
+
+def _unfinished(endpoint: Endpoint, cancel: Cancel) -> Response:
+    """Result of a request without a response, by its time limit or by the end of the service."""
+    if cancel.ended:
+        return Response(None, "the service ends", ended=True)
+    return Response(None, f"no response within {endpoint.timeout_s:g} s")
 
 
 def permitted(
@@ -157,6 +166,11 @@ class Cancel:
         self._lock = threading.Lock()
         self._ended, self._late = False, False
         self._socket: socket.socket | None = None
+
+    @property
+    def ended(self) -> bool:
+        """True after `end`."""
+        return self._ended
 
     @property
     def over(self) -> bool:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.alarms.state_machine import AlarmKind, AlarmState, AlarmTransition, Change, Severity
@@ -172,6 +172,7 @@ def test_filters_select_and_move_the_position(receiver: Receiver, store: Store, 
 # ------------------------------------------------------------------------------------------ order and waits
 
 
+@settings(max_examples=25)
 @given(st.integers(1, 60), st.floats(0.0, 1.0, exclude_max=True))
 def test_the_back_off_doubles_with_jitter(failures: int, u: float) -> None:
     wait = backoff_s(failures, u)
@@ -242,6 +243,7 @@ def rare_polls(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.notify.delivery.POLL_S", 100.0)
 
 
+@pytest.mark.acceptance
 @pytest.mark.usefixtures("rare_polls")
 def test_a_target_that_is_down_gets_everything_after_it_is_back(course: Course, receiver: Receiver) -> None:
     receiver.always = 503
@@ -393,6 +395,9 @@ def test_a_target_that_does_not_answer_delays_no_other(
             notifier.close()
             release.set()
         assert time.monotonic() - begun < 0.5
+        # The end of the service is no failure of the target.
+        time.sleep(0.2)
+        assert notifier.status()[0].failing_since is None
 
 
 def test_an_unexpected_error_ends_no_thread(

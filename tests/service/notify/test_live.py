@@ -66,6 +66,7 @@ def target(live: InProcess) -> dict[str, Any]:
     return dict(found)
 
 
+@pytest.mark.acceptance
 def test_an_attack_is_one_message_at_its_begin_and_one_at_its_end(
     live: InProcess, receiver: Receiver
 ) -> None:
@@ -80,6 +81,7 @@ def test_an_attack_is_one_message_at_its_begin_and_one_at_its_end(
     assert (incident["feeder"], incident["kind"], len(incident["meters"])) == (FEEDER, "manipulation", 4)
 
 
+@pytest.mark.acceptance
 def test_rest_and_the_command_line_show_and_resend_dead_letters(
     live: InProcess, receiver: Receiver, folder: Path, monkeypatch: Any, capsys: Any
 ) -> None:
@@ -117,6 +119,7 @@ def test_rest_and_the_command_line_show_and_resend_dead_letters(
     assert live.get("/api/v1/notifications/dead-letters")["dead_letters"] == []
 
 
+@pytest.mark.acceptance
 def test_dead_letters_are_resent_and_discarded_over_rest(
     live: InProcess, receiver: Receiver, folder: Path
 ) -> None:
