@@ -32,6 +32,7 @@ from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.doubts import Unknown
 from gridsec.estimators.modal.record import Record
 from gridsec.estimators.modal.replay import History
+from gridsec.estimators.modal.search import DOUBT
 from gridsec.estimators.plant import Plant, nothing_new
 from gridsec.estimators.sequential import design as front_design
 from gridsec.estimators.sequential import init as front_init
@@ -295,7 +296,8 @@ def _driven(
     drives = np.zeros(m.size, dtype=np.bool_)
     drives[front.meter_of[front.meter_of >= 0]] = True
     jumps = drives & measured.available & given.trust.trusted & (np.abs(off) > JUMP * std)
-    if not any_of(jumps):
+    if not 0 < np.count_nonzero(jumps) <= design.max_attacked:
+        # Where most readings jump, the busbar's or the loads have; then no inverter can do without them.
         return given, measured, predicted
     trusted = given.trust.trusted & ~jumps
     given = changed(given, trust=replace(given.trust, trusted=trusted))
@@ -358,8 +360,9 @@ def _identified(design: ModalDesign, state: ModalState, evidence: Evidence) -> t
         return replace(after, core=masked, suspicion=None, streak=0 * streak, due=tick + 1), evidence
     if any_of(phases >= CONFIRM):
         return _without_busbar(design, after, suspicion, phases >= CONFIRM)
-    if not any_of(suspicion.found.chosen[0]):
-        # Loads have changed, and no power is false.
+    faulty = suspicion.found.chosen.any(axis=1)
+    if float(suspicion.found.weight[faulty].sum()) < DOUBT:
+        # Loads have changed, and no explanation of weight has a false reading of any kind.
         adopted = core.adopt(kernel, state.core, suspicion)
         if adopted is not state.core:
             return replace(after, core=adopted, suspicion=None), evidence
