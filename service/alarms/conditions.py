@@ -277,6 +277,9 @@ def _data_loss(report: FeederReport) -> Iterable[Condition]:
     most = _most_silent(report)
     if most:
         yield _outage(report, most)
+    elif _mostly(sum(not meter.seen for meter in report.meters), report):
+        # Most meters are unavailable, and not silent yet: an outage neither begins nor ends.
+        yield Condition(AlarmKind.DATA_LOSS, report.feeder, None, Severity.MAJOR, known=False)
     unsure = [meter.meter for meter in report.meters if not meter.seen and meter.meter not in silent]
     busbar_seen = report.busbar.seen and report.cause is not Cause.NO_BUSBAR
     if not busbar_seen and BUSBAR not in silent:
@@ -304,8 +307,12 @@ def _length(seconds: float | None) -> str:
 def _most_silent(report: FeederReport) -> tuple[str, ...]:
     """The silent meters of customers, if these are most of them."""
     silent = tuple(one.meter for one in report.silent if one.meter != BUSBAR)
-    most = len(silent) >= FEW_METERS and len(silent) > MOST_SILENT * len(report.meters)
-    return silent if most else ()
+    return silent if _mostly(len(silent), report) else ()
+
+
+def _mostly(count: int, report: FeederReport) -> bool:
+    """True if a number of meters is most of a feeder's."""
+    return count >= FEW_METERS and count > MOST_SILENT * len(report.meters)
 
 
 def _outage(report: FeederReport, silent: tuple[str, ...]) -> Condition:

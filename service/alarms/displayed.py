@@ -99,7 +99,11 @@ def _undecided(display: Display[T], rules: AlarmRules, tick: T) -> Display[T]:
     lasted = tick.t - since
     due = lasted >= rules.on(AlarmKind.UNDECIDED) and (tick.cause not in _UNHEARD or lasted > rules.silence_s)
     if display.verdict is not Decision.UNDECIDED:
-        return _change(display, tick, since) if due else display
+        if not due:
+            return display
+        # A waiting ATTACKED lasts, as the pending alarm does.
+        answer = None if display.answer is Decision.CLEAN else display.answer
+        return replace(display, newest=tick, since=since, answer=answer)
     starts_again = due and display.answer is Decision.CLEAN
     return replace(display, newest=tick, answer=None if starts_again else display.answer)
 

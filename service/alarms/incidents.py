@@ -550,8 +550,10 @@ class _Work:
                 self._renew(IncidentChange.SHELVED, action.who, action.reason)
             case Unshelve():
                 shelf = self.shelves.get(action.shelf)
-                if shelf is None or shelf.t_ended is not None:
+                if shelf is None:
                     raise ShelfUnknown(action.shelf)
+                if shelf.t_ended is not None:  # it expired meanwhile
+                    return
                 self.shelves[shelf.id] = replace(shelf, t_ended=self.now, ended_by=action.who)
                 self._renew(IncidentChange.UNSHELVED, action.who, action.comment)
             case PlannedWork():
@@ -561,8 +563,10 @@ class _Work:
                     self._renew(IncidentChange.WORK_BEGUN, action.who, action.reason)
             case EndWork():
                 work = self.works.get(action.work)
-                if work is None or work.t_ended is not None:
+                if work is None:
                     raise WorkUnknown(action.work)
+                if work.t_ended is not None:  # it ended meanwhile
+                    return
                 self.works[work.id] = replace(work, t_ended=self.now, ended_by=action.who)
                 self._renew(IncidentChange.WORK_ENDED, action.who, action.comment)
 
@@ -624,7 +628,10 @@ class _Work:
         acts = change in {IncidentChange.ACKNOWLEDGED, IncidentChange.UNACKNOWLEDGED}
         comment = transition.comment if acts or change is IncidentChange.CLEARED else None
         who = transition.who if acts else None
-        self._say(self._suppressed(after), change, who, comment, t=transition.t)
+        after = self._suppressed(after)
+        if change is IncidentChange.EXTENDED and not before.notify and after.notify:
+            change = IncidentChange.UNSHELVED  # one of its alarms is not shelved
+        self._say(after, change, who, comment, t=transition.t)
         if self._escalated:
             self._escalated = False
             self._renew(IncidentChange.UNSHELVED)

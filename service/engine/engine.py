@@ -269,7 +269,12 @@ class Engine:
         self.monitors = {**self.monitors, name: monitor}
         self._wakes[name] = -math.inf
         settings = site.tables.meta.monitor
-        self.load.feeders[name] = FeederLoad(settings.tick_s, len(site.meter_ids) + 1)
+        old = self.load.feeders.get(name)
+        self.load.feeders[name] = FeederLoad(
+            settings.tick_s, len(site.meter_ids) + 1, offered=old.offered if old else 0
+        )
+        if name in self.load.shed:
+            monitor.set_shed(True)
         self.unloaded.pop(name, None)
         self._learn()
         return monitor
@@ -422,8 +427,11 @@ class Engine:
         inbox.shed = shed
         for name in changed:
             inbox.forget(name)
-            self.monitors[name].set_shed(name in shed)
-            self._set_wake(self.monitors[name])
+            monitor = self.monitors.get(name)
+            if monitor is None:  # a removed feeder
+                continue
+            monitor.set_shed(name in shed)
+            self._set_wake(monitor)
         self.metrics.shed.set(len(shed))
         _log.warning("feeders are shed because of overload", feeders=len(shed), changed=changed[:SHOWN])
 
@@ -502,10 +510,11 @@ class Engine:
             monitor = self.monitors.get(problem.feeder or "")
             if problem.reason is not BadReason.SIGNATURE or monitor is None:
                 continue
-            # The last entry of a long batch has no meter; those before it have.
-            meter = problem.meter or (BUSBAR if "/substation/" in problem.key else None)
-            if meter is not None:
-                monitor.refuse(meter, problem.problems[0])
+            for meter in problem.refused or (problem.meter,):
+                if meter is not None:
+                    monitor.refuse(meter, problem.problems[0])
+                elif problem.refused or "/substation/" in problem.key:
+                    monitor.refuse(BUSBAR, problem.problems[0])
 
     def _judge(self) -> list[TickResult]:
         """Evaluate the pending ticks within the time budget; count skipped ones."""

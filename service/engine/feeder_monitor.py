@@ -24,7 +24,7 @@ from feeders.registry import DesignedEstimator, WarmStart
 from gridsec.estimators.sequential import SuspicionRecord
 from gridsec.interface import Cause
 from service.alarms import displayed
-from service.alarms.conditions import conditions, identity_mismatches
+from service.alarms.conditions import AlarmKind, Condition, Severity, conditions, identity_mismatches
 from service.alarms.state_machine import INCIDENT_S, AlarmBook, AlarmRules, AlarmTransition, advance, hold
 from service.engine.commissioning import FeederCommissioning
 from service.ingest.align import Aligner, AlignRules, Clock, Placed, ReadingOutcome, Tick, rules
@@ -308,6 +308,8 @@ class FeederMonitor:
         """Begin or end the time without monitoring; it is no evidence of silence."""
         self.shed = shed
         self.aligner.excuse()
+        # Nothing is decoded meanwhile: problems of refused identities last from the return on.
+        self._refused = {meter: problem for meter, (_, problem) in self._mismatches.items()} | self._refused
 
     def finish(self) -> None:
         """Add all ticks that the time has reached to the pending ones: the input has ended."""
@@ -333,7 +335,9 @@ class FeederMonitor:
         book = self.book
         if tick.skipped:
             book = hold(book, tick.t - tick.skipped * self.aligner.rules.tick_s)
-        mismatches = identity_mismatches(self.name, self._mismatched(tick.t))
+        mismatches = (
+            self._unread(book) if self.shed else identity_mismatches(self.name, self._mismatched(tick.t))
+        )
         for _ in range(2):  # monitored, then failed
             try:
                 state, display = self._complete(self._judge(tick))
@@ -349,6 +353,12 @@ class FeederMonitor:
                 return TickResult(state, transitions)
         self.latest, self._display = self._complete(self._judge(tick))
         return TickResult(self.latest, ())
+
+    def _unread(self, book: AlarmBook) -> list[Condition]:
+        """Unknown conditions of alarms that depend on payloads which a shed feeder does not decode."""
+        kinds = (AlarmKind.IDENTITY_MISMATCH, AlarmKind.CLOCK_OFFSET)
+        found = [key for key in book.entries if key[0] in kinds]
+        return [Condition(kind, self.name, meter, Severity.MAJOR, known=False) for kind, meter in found]
 
     def _connects(self, tick: Tick) -> bool:
         """True while a meter has had no reading since the start and is not silent yet."""

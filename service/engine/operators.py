@@ -41,7 +41,7 @@ from service.alarms.state_machine import (
     unacknowledged,
 )
 from service.engine.feeder_monitor import FeederMonitor
-from service.store import Store
+from service.store import OutcomeUnknown, Store
 from service.store.committer import Committer, Wish
 
 SHELVE_MOST_S = 86_400.0
@@ -122,7 +122,7 @@ class Operators:
             missing = [name for name in alarms if name not in found]
             if missing:
                 raise AlarmUnknown(missing[0])
-            self._store([found[name] for name in alarms], change, answer, lambda changed: changed)
+            self._store([found[name] for name in alarms], change, answer, lambda _, changed: changed)
 
         self._look(partial(_alarms, ids=alarms), store, answer)
         return answer
@@ -132,22 +132,23 @@ class Operators:
         alarms: Iterable[Alarm],
         change: Callable[[Alarm], AlarmTransition | None],
         answer: Future[T],
-        result: Callable[[list[Alarm]], T],
+        read: Callable[[Store, list[Alarm]], T],
     ) -> None:
-        """Store changes of alarms; books in memory are newer than the database."""
+        """Store changes of alarms, and read the result; books in memory are newer than the database."""
         held = {one.id: one for monitor in self._engine.monitors.values() for one in monitor.book.alarms}
         present = [held.get(alarm.id, alarm) for alarm in alarms]
         changed = [(alarm, change(alarm)) for alarm in present]
         transitions = [transition for _, transition in changed if transition is not None]
         after = [alarm if transition is None else transition.alarm for alarm, transition in changed]
 
-        def landed() -> None:
+        def landed(found: T | None) -> None:
             for transition in transitions:
                 self._engine.carry_over(transition.alarm)
-            if not answer.done():
-                answer.set_result(result(after))
+            _give(answer, found)
 
-        self._engine.committer.store(Wish(tuple(transitions)), landed, partial(_refuse, answer))
+        self._engine.committer.store_and_read(
+            Wish(tuple(transitions)), lambda db: read(db, after), landed, partial(_refuse, answer)
+        )
 
     # ------------------------------------------------------------------- incidents
 
@@ -180,7 +181,7 @@ class Operators:
             if count is not None and count != seen.count:
                 raise IncidentChanged(seen, count)
             active = [one for one in alarms if one.active]
-            self._store(active, change, answer, lambda _: self._engine.store.incident(incident) or seen)
+            self._store(active, change, answer, lambda db, _: db.incident(incident) or seen)
 
         self._look(partial(_incident_with_alarms, number=incident), store, answer)
         return answer
@@ -273,12 +274,11 @@ class Operators:
             if isinstance(made, GridsecError):
                 raise made
 
-            def landed(found: T) -> None:
-                if not answer.done():
-                    answer.set_result(found)
-
             self._engine.committer.store_and_read(
-                Wish(actions=(made,)), lambda db: read(db, made), landed, partial(_refuse, answer)
+                Wish(actions=(made,)),
+                lambda db: read(db, made),
+                lambda found: _give(answer, found),
+                partial(_refuse, answer),
             )
 
         self._look(look, store, answer)
@@ -343,6 +343,14 @@ def _highest(alarms: Iterable[Alarm]) -> Severity:
     for alarm in alarms:
         found = alarm.severity if higher(alarm.severity, found) else found
     return found
+
+
+def _give(answer: Future[T], found: T | None) -> None:
+    """Set the result of a stored action; None if it could not be read after the commit."""
+    if found is None:
+        _refuse(answer, OutcomeUnknown("the change is stored; its result cannot be read"))
+    elif not answer.done():
+        answer.set_result(found)
 
 
 def _refuse(answer: Future[Any], error: GridsecError) -> None:

@@ -21,7 +21,7 @@ import json
 import math
 import reprlib
 import struct
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -161,6 +161,8 @@ class BadReading:
     head: str = ""  # the beginning of the payload or element, printable
     # Number of readings that this entry stands for (more than one only for the tail of a bad batch).
     count: int = 1
+    # Sources of all refused readings of the batch, None for the busbar meter; in its first such entry.
+    refused: tuple[str | None, ...] = ()
 
 
 ORDERS_KEPT = 32
@@ -800,6 +802,7 @@ def _verified(
     readings, bad = decoded.readings, list(decoded.bad)
     accepted = np.ones(len(readings), dtype=np.bool_)
     more: Counter[BadReason] = Counter()
+    refused: dict[BadReason, list[str | None]] = defaultdict(list)
     for k, source in enumerate(readings.source.tolist()):
         meter = None if source == len(known.order) else known.order[source]
         refusal = check(readings.feeder, meter)
@@ -808,8 +811,12 @@ def _verified(
         accepted[k] = False
         reason = BadReason(refusal.reason)
         more[reason] += 1
+        refused[reason].append(meter)
         if more[reason] <= DETAILED_PER_REASON:
             bad.append(replace(base, reason=reason, problems=(refusal.problem,), meter=meter))
+    for reason, meters in refused.items():
+        first = next(k for k, one in enumerate(bad) if one.reason is reason and k >= len(decoded.bad))
+        bad[first] = replace(bad[first], refused=tuple(dict.fromkeys(meters)))
     for reason, count in more.items():
         if (rest := count - DETAILED_PER_REASON) > 0:
             problem = f"{rest} more elements of the batch: {reason}"

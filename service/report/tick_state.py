@@ -221,7 +221,7 @@ class TickState:
         """Meters that a condition may depend on, (p,)."""
         site, judgement = self.site, self.judgement
         which = np.zeros(site.meters.size, dtype=np.bool_)
-        if self.tick.silent:
+        if self.tick.silent or (None in subjects and not self.tick.seen.all()):
             return ~which  # the share of the silent meters is a condition, too
         if subjects:
             which |= np.array([meter in subjects for meter in site.meter_ids], dtype=np.bool_)

@@ -92,7 +92,7 @@ ALARM = sa.Table(
     sa.Column("t_raised", sa.Double, nullable=False),
     sa.Column("t_cleared", sa.Double),
     sa.Column("data", sa.Text, nullable=False),
-    sa.Column("incident", sa.String(26)),  # null only for alarms that cleared before schema version 6
+    sa.Column("incident", sa.String(26)),  # null only for alarms that cleared before schema version 7
     sa.Column("work", sa.String(26)),  # planned work during which it was raised
     sa.Column("words", sa.Text, nullable=False, server_default=""),  # text for searches, in lower case
     sa.Index("alarm_by_feeder", "feeder", "state"),

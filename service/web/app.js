@@ -5,7 +5,7 @@ import { Incidents } from "./incidents.js";
 import { Commissioning } from "./commissioning.js";
 import { showDetail } from "./detail.js";
 import { Diagram } from "./diagram.js";
-import { bare, busbarWords, byId, clock, duration, el, getJson, isKnown, signed, status, volt } from "./dom.js";
+import { bare, busbarWords, byId, clock, deviceName, duration, el, getJson, isKnown, signed, status } from "./dom.js";
 import { Fleet } from "./fleet.js";
 import { session } from "./session.js";
 import { Banner, offline } from "./banner.js";
