@@ -410,7 +410,7 @@ def another_name(_: Path, __: Patch) -> None:
 
 
 def put_nan(_: Path, __: Patch) -> None:
-    from service.api.routes import put_feeder
+    from service.api.feeders import put_feeder
 
     asyncio.run(put_feeder(cast(Any, None), "village", {"meta": math.nan}))
 
