@@ -475,7 +475,7 @@ def test_metrics_and_bad_readings(setup: Setup) -> None:
 def test_the_description_tells_of_problems(setup: Setup) -> None:
     schema = setup.get("/openapi.json").json()
     operations = [op for path in schema["paths"].values() for op in path.values()]
-    assert len(operations) == 43
+    assert len(operations) == 48
     for operation in operations:
         assert list(operation["responses"]["default"]["content"]) == ["application/problem+json"]
         assert "422" not in operation["responses"]
