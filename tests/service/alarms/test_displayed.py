@@ -15,7 +15,6 @@ from feeders.simulation.plant import Channel
 from feeders.simulation.recording import read_recording, record
 from feeders.simulation.scenario import Scenario
 from gridsec.interface import Cause, Decision
-from service.alarms import displayed
 from service.alarms.displayed import Display, advance
 from service.alarms.state_machine import AlarmBook, AlarmKind, AlarmRules, conditions
 from service.alarms.state_machine import advance as advance_alarms
@@ -69,14 +68,27 @@ def test_the_shown_reason_and_suspects_belong_to_the_shown_verdict() -> None:
     display = advance(None, RULES, tick(T0, "A"))
     for k, letter in enumerate("CSU", start=1):
         display = advance(display, RULES, tick(T0 + k, letter))
-    now = displayed.shown(display)
+    now = display.newest
     assert (now.verdict, now.suspects, now.t) == ("attacked", ("m0",), T0)
     for k in range(4, 12):
         display = advance(display, RULES, tick(T0 + k, "C"))
-    now = displayed.shown(display)
+    now = display.newest
     assert (now.verdict, now.suspects) == ("clean", ())
     # Its first tick came before the undecided ones.
-    assert (now.since, now.t) == (T0 + 1, T0 + 11)
+    assert (display.since, now.t) == (T0 + 1, T0 + 11)
+
+
+def test_a_waiting_attack_lasts_while_undecided_is_displayed() -> None:
+    assert letters_of("CCCAAUUUAAA") == "CCCCCCCUAAA"
+    display = advance(None, RULES, tick(T0, "C"))
+    for k, letter in enumerate("CCAAUUU", start=1):
+        display = advance(display, RULES, tick(T0 + k, letter))
+    now = display.newest
+    assert (display.verdict, now.verdict, now.reason) == (Decision.UNDECIDED, Decision.UNDECIDED, "U")
+    assert (display.since, now.t, display.t) == (T0 + 5, T0 + 7, T0 + 7)
+    assert (display.answer, display.onset) == (Decision.ATTACKED, T0 + 3)
+    # CLEAN waits from its first tick on after UNDECIDED.
+    assert letters_of("AAACCCCUUUCCCCCCC") == "AAAAAAAAAUUUUUUCC"
 
 
 def test_skipped_ticks_and_a_clock_set_back() -> None:

@@ -240,8 +240,24 @@ def test_a_shelf_ends_early_once() -> None:
     book, _ = act(book, shelf(alarm=alarm(1).id))
     book, happened = act(book, Unshelve("village", "S" * 26, "Eve", "back"))
     assert [(i.change, i.who, i.comment, i.notify) for i in happened] == [(C.UNSHELVED, "Eve", "back", True)]
+    # It ended between the request and its turn.
+    assert act(book, Unshelve("village", "S" * 26, "Bob")) == (book, [])
     with refused(ShelfUnknown, "unknown-shelf"):
-        act(book, Unshelve("village", "S" * 26, "Eve"))
+        act(book, Unshelve("village", "T" * 26, "Eve"))
+
+
+def test_an_alarm_outside_of_the_shelf_ends_the_suppression_of_its_incident() -> None:
+    one, two = alarm(1), alarm(2)
+    book, _ = run(raised(one), raised(two))
+    book, _ = run(cleared(two, T0 + 5), book=book)
+    book, happened = act(book, shelf(meter="m1"))
+    assert (changes(happened), only(book).notify) == ([C.SHELVED], False)
+    book, happened = run(again(two, T0 + 300), now=T0 + 300, book=book)
+    assert [(item.change, item.notify, item.t) for item in happened] == [(C.UNSHELVED, True, T0 + 300)]
+    assert only(book).shelved_until is None
+    # A further one: the incident notifies already.
+    _, happened = run(raised(alarm(3, T0 + 310)), now=T0 + 310, book=book)
+    assert changes(happened) == [C.EXTENDED]
 
 
 def test_of_two_shelves_the_later_one_counts() -> None:
@@ -285,8 +301,9 @@ def test_planned_work_begins_at_once_and_ends_early() -> None:
     assert [(i.change, i.who) for i in happened] == [(C.WORK_BEGUN, "Ada")]
     book, happened = act(book, EndWork("village", "W" * 26, "Eve", "done"))
     assert [(i.change, i.who, i.notify) for i in happened] == [(C.WORK_ENDED, "Eve", True)]
+    assert act(book, EndWork("village", "W" * 26, "Bob")) == (book, [])
     with refused(WorkUnknown, "unknown-planned-work"):
-        act(book, EndWork("village", "W" * 26, "Eve"))
+        act(book, EndWork("village", "V" * 26, "Eve"))
 
 
 def test_missed_work_begins_and_ends_together() -> None:

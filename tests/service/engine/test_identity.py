@@ -122,6 +122,18 @@ def test_a_batch_of_another_concentrator_is_of_its_meters(signed: Signed) -> Non
     assert signed.standing() == {(AlarmKind.IDENTITY_MISMATCH, "m01")}
 
 
+def test_all_refused_meters_of_a_long_batch_and_the_busbar_have_an_alarm(signed: Signed) -> None:
+    signed.run(3)
+    # Each bad reading has an entry up to a limit, which the first meter exceeds.
+    rows = [{"meter": meter, "t": START + 3.0, "v_volt": 250.0} for meter in ("m02", "m01") for _ in range(20)]
+    payload = json.dumps(rows).encode()
+    batch = Sample(BATCH, payload, "application/json", signed.wall, len(payload))
+    signed.run(1, batch, signed.forged("substation", "m01"))
+    signed.run(5)
+    expected = {(AlarmKind.IDENTITY_MISMATCH, meter) for meter in ("m01", "m02", "substation")}
+    assert signed.standing() == expected
+
+
 def test_a_replayed_or_malformed_reading_is_no_mismatch(signed: Signed) -> None:
     signed.run(5)
     again = next(iter(signed.readings(2)))

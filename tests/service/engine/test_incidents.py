@@ -23,7 +23,7 @@ from service.alarms.state_machine import AlarmKind, AlarmUnknown, NotAcknowledge
 from service.engine.engine import Engine
 from service.engine.operators import SHELVE_MOST_S, ShelfRequest
 from service.ingest.queues import Sample
-from service.store import Store
+from service.store import OutcomeUnknown, Store, StoreUnavailable
 from tests.codes import refused
 from tests.service.engine.test_silence import QUIET_VOLT, Street
 from tests.service.liars import FEEDER, START, rounds, until
@@ -124,6 +124,31 @@ def test_unknown_and_outdated_requests_change_nothing(live: Engine) -> None:
             of(run())
     assert live.store.last_incident_event == number
     assert act.shelve_most_s == SHELVE_MOST_S
+
+
+def test_an_answer_that_cannot_be_read_is_refused_and_stays_stored(
+    live: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name, look, committed = only(live.store).id, Store.incident, Store.commit
+
+    def fail(_store: Store, _number: str) -> Incident:
+        raise StoreUnavailable("connection lost")
+
+    def commit(store: Store, changes: Any, **given: Any) -> Any:
+        """Store; only the read after the commit of the acknowledgements fails."""
+        if changes:
+            monkeypatch.setattr(Store, "incident", fail)
+        return committed(store, changes, **given)
+
+    monkeypatch.setattr(Store, "commit", commit)
+    answer = live.operators.acknowledge_incident(name, "Ada", "van sent")
+    with pytest.raises(OutcomeUnknown, match="is stored"):
+        of(answer)
+    monkeypatch.setattr(Store, "incident", look)
+    found = live.store.incident(name)
+    assert found is not None
+    assert (found.unacknowledged, found.acknowledged_by) == (0, "Ada")
+    assert {one.acknowledged_by for one in live.monitors[FEEDER].book.active} == {"Ada"}
 
 
 def test_shelves_and_work_end_by_the_wall_clock_and_survive_a_restart(

@@ -1,0 +1,162 @@
+"""Shed feeders: their alarms last unread, and they can be removed and put again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from feeders.model.site import Site, from_tables
+from gridsec.interface import Cause
+from service.alarms.state_machine import AlarmKind
+from service.engine.engine import Engine, RuntimeConfig
+from service.engine.feeder_monitor import MISMATCH_S, design
+from service.ingest.align import Clock
+from service.ingest.queues import Inbox, Sample
+from service.store import Store
+from tests.service.engine.test_load import shed_by
+from tests.service.liars import FEEDER, START
+
+OTHER = "other"
+QUIET_VOLT = 230.9
+OFFSET_S = 5.0
+"""Error of the clock of a meter, s: above the tolerance of the alignment."""
+OUTAGE = (AlarmKind.DATA_LOSS, None)
+
+
+class Pair:
+    """Two equal feeders at no load by the wall clock, the second of which is shed."""
+
+    def __init__(self, site: Site, store: Store, t: float = START) -> None:
+        self.store, self.wall = store, t
+        self.other = from_tables(replace(site.tables, meta=replace(site.tables.meta, name=OTHER)))
+        self.box = Inbox(lambda: None, lossless=False, feeder_of=lambda key: key.split("/")[1])
+        self.live = Engine(
+            RuntimeConfig(clock=Clock.WALL),
+            store,
+            [site, self.other],
+            wall=lambda: self.wall,
+            stored=lambda: None,
+        )
+        for monitor in self.live.monitors.values():
+            monitor.install(design(monitor.site))
+        self.live.begin()
+
+    def shed(self, *names: str) -> None:
+        """Shed these feeders, and monitor all others."""
+        self.live.load.shed = dict.fromkeys(names, 0.0)
+        shed_by(self.live, self.box)
+
+    def run(
+        self, seconds: int, *, silent: Collection[str] = (), late: str = "", refused: Collection[str] = ()
+    ) -> None:
+        """Readings of each second.
+
+        silent: feeders without readings.
+        late: meter of the second feeder with an error of the clock.
+        refused: meters of the second feeder with a reading of another identity.
+        """
+        for _ in range(seconds):
+            self.wall += 0.05
+            for name in set(self.live.monitors) - {*silent}:
+                self.box.put(list(self._samples(name, late if name == OTHER else "")))
+            for meter in refused:
+                self.live.monitors[OTHER].refuse(meter, "the signature does not fit")
+            self.live.cycle(self.box.drain(10_000), self.box.oldest)
+            self.wall += 0.85
+            self.live.cycle([], self.box.oldest)
+            self.wall += 0.1
+
+    def _samples(self, name: str, late: str) -> Iterator[Sample]:
+        for meter in ("substation", *self.other.meter_ids):
+            age = OFFSET_S if meter == late else 0.05
+            payload = json.dumps({"t": self.wall - age, "v_volt": QUIET_VOLT, "p_kw": 0.0, "q_kvar": 0.0})
+            place = meter if meter == "substation" else f"meter/{meter}"
+            yield Sample(f"gridsec/{name}/{place}/reading", payload.encode(), "", self.wall, len(payload))
+
+    def standing(self) -> set[tuple[AlarmKind, str | None]]:
+        return {(alarm.kind, alarm.meter) for alarm in self.store.active(OTHER)}
+
+    def cause(self) -> Cause:
+        report = self.live.monitors[OTHER].report
+        assert report is not None
+        return report.cause
+
+
+@pytest.fixture
+def pair(site: Site, tmp_path: Path) -> Iterator[Pair]:
+    with Store(f"sqlite:///{tmp_path / 's.db'}") as store:
+        yield Pair(site, store)
+
+
+def test_a_shed_feeder_can_be_removed(pair: Pair) -> None:
+    pair.run(2)
+    pair.shed(OTHER)
+    pair.live.remove(OTHER).result(timeout=0)
+    pair.shed()
+    pair.run(3)
+    assert (pair.box.shed, set(pair.live.monitors)) == (frozenset(), {FEEDER})
+    report = pair.live.monitors[FEEDER].report
+    assert report is not None
+    assert report.t > pair.wall - 2.0
+
+
+def test_a_shed_feeder_that_is_put_again_stays_shed(pair: Pair) -> None:
+    pair.run(3)
+    pair.shed(OTHER)
+    pair.run(2)
+    offered = pair.live.load.feeders[OTHER].offered = pair.box.offered()[OTHER]
+    pair.live.add(pair.other).install(design(pair.other))
+    # The count of its samples goes on: the next window sees no flood.
+    assert pair.live.load.feeders[OTHER].offered == offered > 0
+    pair.run(16)
+    assert (pair.cause(), pair.standing()) == (Cause.OVERLOAD, {(AlarmKind.UNDECIDED, None)})
+    pair.shed()
+    pair.run(9)
+    assert pair.cause() is not Cause.OVERLOAD
+    assert pair.standing() == set()
+
+
+def test_an_outage_lasts_while_its_feeder_is_shed_and_after_a_restart(site: Site, tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 's.db'}"
+    with Store(url) as store:
+        pair = Pair(site, store)
+        pair.run(3)
+        pair.run(16, silent={OTHER})
+        assert OUTAGE in pair.standing()
+        (outage,) = store.alarms(feeder=OTHER, kind=["data-loss"])[0]
+        pair.shed(OTHER)
+        pair.run(12, silent={OTHER})
+        assert OUTAGE in pair.standing()
+        pair.shed()
+        pair.run(3, silent={OTHER})
+        t = pair.wall
+    with Store(url) as store:
+        pair = Pair(site, store, t)
+        # Before the meters are silent again, and after it.
+        pair.run(8, silent={OTHER})
+        assert OUTAGE in pair.standing()
+        pair.run(8, silent={OTHER})
+        (still,) = store.alarms(feeder=OTHER, kind=["data-loss"])[0]
+        assert (still.id, still.count, still.active) == (outage.id, 1, True)
+        pair.run(10)
+        assert pair.standing() == set()
+
+
+def test_alarms_that_depend_on_payloads_last_while_their_feeder_is_shed(pair: Pair) -> None:
+    late, refused = pair.other.meter_ids[2], pair.other.meter_ids[0]
+    expected = {(AlarmKind.CLOCK_OFFSET, late), (AlarmKind.IDENTITY_MISMATCH, refused)}
+    pair.run(20, late=late, refused=(refused,))
+    assert expected <= pair.standing()
+    pair.shed(OTHER)
+    pair.run(int(MISMATCH_S) + 10)
+    assert expected <= pair.standing()
+    pair.shed()
+    pair.run(5)
+    # The refused identity lasts from the return on.
+    assert (AlarmKind.IDENTITY_MISMATCH, refused) in pair.standing()
+    pair.run(int(MISMATCH_S) + 10)
+    assert pair.standing() == set()
