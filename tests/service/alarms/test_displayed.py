@@ -7,7 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from feeders.model.site import load
@@ -107,6 +107,10 @@ letters = st.text("ACUS", min_size=1, max_size=60)
 
 @settings(max_examples=60)
 @given(letters)
+@example("CAAUUUA")
+@example("AUUUAAU")
+@example("ACAUUUAA")
+@example("CCCAAUUUAAA")
 def test_the_page_and_the_alarm_list_agree(sequence: str) -> None:
     """When the alarm of a manipulation rises, ATTACKED is displayed; when it clears, CLEAN is."""
     display: Display[FeederReport] | None = None

@@ -125,7 +125,9 @@ def test_a_batch_of_another_concentrator_is_of_its_meters(signed: Signed) -> Non
 def test_all_refused_meters_of_a_long_batch_and_the_busbar_have_an_alarm(signed: Signed) -> None:
     signed.run(3)
     # Each bad reading has an entry up to a limit, which the first meter exceeds.
-    rows = [{"meter": meter, "t": START + 3.0, "v_volt": 250.0} for meter in ("m02", "m01") for _ in range(20)]
+    rows = [
+        {"meter": meter, "t": START + 3.0, "v_volt": 250.0} for meter in ("m02", "m01") for _ in range(20)
+    ]
     payload = json.dumps(rows).encode()
     batch = Sample(BATCH, payload, "application/json", signed.wall, len(payload))
     signed.run(1, batch, signed.forged("substation", "m01"))

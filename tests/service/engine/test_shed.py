@@ -155,8 +155,8 @@ def test_alarms_that_depend_on_payloads_last_while_their_feeder_is_shed(pair: Pa
     pair.run(int(MISMATCH_S) + 10)
     assert expected <= pair.standing()
     pair.shed()
-    pair.run(5)
-    # The refused identity lasts from the return on.
+    # The refused identity lasts from the return on, longer than `off_delay_s`.
+    pair.run(12)
     assert (AlarmKind.IDENTITY_MISMATCH, refused) in pair.standing()
     pair.run(int(MISMATCH_S) + 10)
     assert pair.standing() == set()
