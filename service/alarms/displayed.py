@@ -7,7 +7,8 @@ and the clocks of the alarms (`state_machine`), so that the page and the alarm l
   neither confirms nor refutes. CLEAN starts again after a time without an answer that displays UNDECIDED.
 - UNDECIDED after `on_delay_s` without another verdict; where readings are missing, after `silence_s`.
 
-Time is an argument. The first tick, and a tick that is not after the last one, are displayed at once.
+Time is an argument. The first tick, and a tick that is not after the last one, are displayed at once; the
+clock of their verdict begins there, as that of the alarm does.
 """
 
 from __future__ import annotations
@@ -52,11 +53,12 @@ class Display(Generic[T]):
     newest: T  # newest tick with the displayed verdict
     since: float  # first tick of the time that led to it, Unix s
     t: float  # time of the last tick, Unix s
-    answer: Decision | None = None  # other verdict than the displayed one, CLEAN or ATTACKED, that waits
+    answer: Decision | None = None  # CLEAN or ATTACKED whose delay is not over; it may be displayed at once
     onset: float = 0.0  # its first tick, Unix s
     lasted_s: float = 0.0  # its time without undecided ticks, s
     held: bool = False  # its clock stands still since an undecided tick
     undecided_since: float | None = None  # first of the undecided ticks up to the last one, Unix s
+    confirmed: bool = False  # the delay of the displayed verdict is over
 
     @property
     def verdict(self) -> Decision:
@@ -67,8 +69,9 @@ class Display(Generic[T]):
 def advance(display: Display[T] | None, rules: AlarmRules, tick: T) -> Display[T]:
     """Update the displayed verdict by one tick; None before the first one."""
     if display is None or tick.t <= display.t:
-        no_answer = tick.t if tick.verdict is Decision.UNDECIDED else None
-        return Display(tick, tick.t, tick.t, undecided_since=no_answer)
+        if tick.verdict is Decision.UNDECIDED:
+            return Display(tick, tick.t, tick.t, undecided_since=tick.t)
+        return _decided(Display(tick, tick.t, tick.t), rules, tick)
     if tick.verdict is Decision.UNDECIDED:
         after = _undecided(display, rules, tick)
     else:
@@ -80,7 +83,9 @@ def _decided(display: Display[T], rules: AlarmRules, tick: T) -> Display[T]:
     """The display after a tick with an answer."""
     display = replace(display, undecided_since=None)
     if tick.verdict is display.verdict:
-        return replace(display, newest=tick, answer=None, held=False)
+        display = replace(display, newest=tick)
+        if display.confirmed:
+            return replace(display, answer=None, held=False)
     if display.answer is not tick.verdict:
         display = replace(display, answer=tick.verdict, onset=tick.t, lasted_s=0.0)
     else:
@@ -88,7 +93,10 @@ def _decided(display: Display[T], rules: AlarmRules, tick: T) -> Display[T]:
     display = replace(display, held=False)
     kind = AlarmKind.METER_MANIPULATED
     delay = rules.on(kind) if tick.verdict is Decision.ATTACKED else rules.off(kind)
-    return _change(display, tick, display.onset) if display.lasted_s >= delay else display
+    if display.lasted_s < delay:
+        return display
+    since = display.since if tick.verdict is display.verdict else display.onset
+    return replace(display, newest=tick, since=since, answer=None, confirmed=True)
 
 
 def _undecided(display: Display[T], rules: AlarmRules, tick: T) -> Display[T]:
@@ -113,8 +121,3 @@ def _ticked(display: Display[T], tick: T) -> Display[T]:
     if display.answer is None or display.held or tick.skipped:
         return display
     return replace(display, lasted_s=display.lasted_s + tick.t - display.t)
-
-
-def _change(display: Display[T], tick: T, since: float) -> Display[T]:
-    """The display of another verdict."""
-    return replace(display, newest=tick, since=since, answer=None)
