@@ -7,8 +7,10 @@ and the clocks of the alarms (`state_machine`), so that the page and the alarm l
   neither confirms nor refutes. CLEAN starts again after a time without an answer that displays UNDECIDED.
 - UNDECIDED after `on_delay_s` without another verdict; where readings are missing, after `silence_s`.
 
-Time is an argument. The first tick, and a tick that is not after the last one, are displayed at once; the
-clock of their verdict begins there, as that of the alarm does.
+The alarm of a manipulation may clear while CLEAN has started again: UNDECIDED is displayed then.
+
+Time is an argument. The first tick, and a tick that is not after the last one, are displayed at once. The
+clock of the verdict begins there, as that of the alarm does.
 """
 
 from __future__ import annotations
@@ -53,7 +55,7 @@ class Display(Generic[T]):
     newest: T  # newest tick with the displayed verdict
     since: float  # first tick of the time that led to it, Unix s
     t: float  # time of the last tick, Unix s
-    answer: Decision | None = None  # CLEAN or ATTACKED whose delay is not over; it may be displayed at once
+    answer: Decision | None = None  # CLEAN or ATTACKED during its delay; at the start it is displayed, too
     onset: float = 0.0  # its first tick, Unix s
     lasted_s: float = 0.0  # its time without undecided ticks, s
     held: bool = False  # its clock stands still since an undecided tick
