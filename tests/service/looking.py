@@ -37,7 +37,7 @@ class Site:
             lambda r: None if r.url.startswith(self.server.url) else self.complaints.append(r.url),
         )
         page.goto(self.server.url + path)
-        page.evaluate("document.getElementById('alarm-box').open = true")
+        page.evaluate("document.querySelectorAll('#alarm-box').forEach(box => { box.open = true; })")
         self.pages.append(page)
         return page
 
