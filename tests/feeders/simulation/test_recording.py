@@ -81,6 +81,7 @@ def test_readings_and_truth_come_back(tmp_path: Path, monkeypatch: pytest.Monkey
     assert sorted(p.name for p in tmp_path.iterdir()) == ["day.parquet", "day.truth.parquet"]
 
 
+@pytest.mark.acceptance
 def test_the_same_scenario_gives_the_same_bytes(tmp_path: Path) -> None:
     site = village()
     one = record(site, busy(), tmp_path / "one.parquet").path

@@ -267,6 +267,7 @@ def test_support_wants_a_threshold() -> None:
 # Feeders.
 
 
+@pytest.mark.acceptance
 def test_both_are_named_on_a_line_for_every_inverter_and_meter() -> None:
     made = yang2021_feeder.bank()
     assert made.guaranteed

@@ -261,6 +261,7 @@ def test_an_open_stream_ends_with_its_key(running: InProcess, folder: Path, path
         assert time.monotonic() - begun < 10.0
 
 
+@pytest.mark.acceptance
 def test_a_lost_database_of_access_does_not_open_the_service(tmp_path: Path) -> None:
     text = key(tmp_path, Role.ADMIN)
     with service(tmp_path, (OTHER,)) as made:
@@ -300,6 +301,7 @@ def started(folder: Path, **given: Any) -> Iterator[InProcess]:
         yield made
 
 
+@pytest.mark.acceptance
 def test_a_network_address_needs_authentication(tmp_path: Path) -> None:
     with refused(SettingsInvalid, "no-authentication"), started(tmp_path):
         pass

@@ -216,6 +216,7 @@ def test_real_zenoh_sessions_are_bounded_and_leave_http_alone(tmp_path: Path) ->
         small.answers()
 
 
+@pytest.mark.acceptance
 def test_a_body_has_a_time_out_and_a_stream_has_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("HEADER_S", "BODY_S", "STALLED_S"):
         monkeypatch.setattr(listener, name, 1.0)

@@ -128,6 +128,7 @@ def ended(child: subprocess.Popen[str]) -> float:
 # --- errors -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.acceptance
 def test_an_http_port_in_use(tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -477,6 +478,7 @@ def test_a_log_that_cannot_be_written_stops_nothing(tmp_path: Path, disk: bool) 
         )
 
 
+@pytest.mark.acceptance
 def test_simulate_onto_zenoh_in_step_with_a_service(gridsec: Run, tmp_path: Path) -> None:
     with serving(tmp_path, "--clock", "events") as (_child, url, zenoh):
         done = gridsec(

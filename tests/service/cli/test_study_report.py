@@ -262,6 +262,7 @@ def test_tables_sort_and_the_summary_is_one_page_of_paper(
 
 
 @pytest.mark.browser
+@pytest.mark.acceptance
 def test_tables_and_legends_of_all_studies_fit_on_a_phone_and_on_paper(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -143,6 +143,7 @@ def test_a_defect_in_one_feeder_s_monitor_is_shown_and_blinds_no_other(
         assert outlet.estimates[-1]["verdict"] == "undecided"
 
 
+@pytest.mark.acceptance
 def test_what_was_found_before_a_defect_is_not_lost(
     site: Site, attacked: list[Sample], path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

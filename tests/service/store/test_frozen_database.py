@@ -146,6 +146,7 @@ class FreezeAtCommit:
 
 
 @pytest.mark.postgresql
+@pytest.mark.acceptance
 def test_a_commit_without_an_answer_is_told_by_its_key(cluster: Cluster) -> None:
     """The server gets the COMMIT and executes it when it goes on."""
     alarm = an_alarm()

@@ -173,6 +173,7 @@ def test_suspects_of_a_real_feeder_are_in_the_window(
 # --------------------------------------------------- branches, zoom and pan
 
 
+@pytest.mark.acceptance
 def test_quiet_branches_collapse_open_and_close(site_of: Callable[..., Site], village: type) -> None:
     site = site_of(village("village", 200))
     site.tick(T0)

@@ -242,7 +242,7 @@ def run_lengths(model: ResidualModel, gamma: float, runs: int, seed: int) -> Flo
     return out
 
 
-@pytest.mark.canary("busbar-100.0-40", "mixed-100.0-40")
+@pytest.mark.canary("mixed-100.0-40")
 @pytest.mark.parametrize(("gamma", "runs"), [(100.0, 40), (1000.0, 12)])
 @pytest.mark.parametrize("make", [busbar, mixed])
 def test_average_run_length_is_at_least_gamma(make: object, gamma: float, runs: int) -> None:

@@ -78,14 +78,9 @@ def test_the_first_of_the_rivals_is_the_model() -> None:
 STEPS_OF_PLACES = np.vstack([np.zeros((1, 12)), STEPS])
 
 
+@pytest.mark.canary("complete-False", "random-True")
 @pytest.mark.parametrize(
-    ("kind", "liar"),
-    [
-        ("complete", False),
-        ("random", True),
-        pytest.param("complete", True, marks=pytest.mark.acceptance),
-        pytest.param("random", False, marks=pytest.mark.acceptance),
-    ],
+    ("kind", "liar"), [("complete", False), ("random", True), ("complete", True), ("random", False)]
 )
 def test_loads_that_jump_accuse_no_honest_meter(kind: str, liar: bool) -> None:
     """Five cars of 11 kW, each for a minute: none is named but a meter that is off by 2 %."""
