@@ -102,6 +102,7 @@ def test_a_suspect_compared_with_its_reconstruction(
     assert (state["displayed"]["verdict"], state["displayed"]["suspects"]) == ("attacked", [liar])
     assert state["displayed"]["since"] >= state["t"] - TICKS + ONSET
     page = opened("", size, scheme)
+    page.locator("#alarm-box > summary").click()
     page.locator('.alarm:has-text("Meter manipulated") button:has-text("Time series")').first.click()
     expect(page.locator("#series-title")).to_be_focused()
     expect(page.locator("#series-chart .panel")).to_have_count(1)
