@@ -318,13 +318,18 @@ class LetterCount(BaseModel):
     count: int
 
 
-class Acknowledgement(BaseModel):
-    """Acknowledgement by an operator."""
+class Answer(BaseModel):
+    """Operator and comment of an action."""
 
     model_config = ConfigDict(extra="forbid")
 
     who: Who = None
     comment: Text = ""
+
+
+class Acknowledgement(Answer):
+    """Acknowledgement by an operator."""
+
     count: int | None = Field(
         default=None,
         ge=1,
@@ -332,23 +337,15 @@ class Acknowledgement(BaseModel):
     )
 
 
-class BulkAcknowledgement(BaseModel):
+class BulkAcknowledgement(Answer):
     """Acknowledgement of several alarms; those that are acknowledged already stay."""
 
-    model_config = ConfigDict(extra="forbid")
-
-    who: Who = None
-    comment: Text = ""
     alarms: Annotated[list[Id], Field(min_length=1, max_length=1000)]
 
 
-class IncidentAcknowledgement(BaseModel):
+class IncidentAcknowledgement(Answer):
     """Acknowledgement of all active alarms of an incident."""
 
-    model_config = ConfigDict(extra="forbid")
-
-    who: Who = None
-    comment: Text = ""
     count: int | None = Field(
         default=None,
         ge=1,
@@ -356,13 +353,8 @@ class IncidentAcknowledgement(BaseModel):
     )
 
 
-class Withdrawal(BaseModel):
+class Withdrawal(Answer):
     """Withdrawal of an acknowledgement, or early end of a shelf or of planned work."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    who: Who = None
-    comment: Text = ""
 
 
 class Remark(BaseModel):

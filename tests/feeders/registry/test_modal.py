@@ -70,7 +70,7 @@ def attacked() -> tuple[Any, list[Estimate], list[Verdict]]:
 
 
 def test_liars_are_named_and_their_voltages_reconstructed() -> None:
-    """CLEAN before, all three named within three seconds, nobody else; evidence and attack fit the lie."""
+    """CLEAN before, exactly the three named within three seconds; evidence and attack fit the bias."""
     frames, truth = played()
     _, estimates, verdicts = attacked()
     assert {verdict.decision for verdict in verdicts[20:ONSET]} == {Decision.CLEAN}

@@ -54,7 +54,7 @@ def moment(seed: int, *, learned: bool = True) -> Scales:
 
 
 def told(scales: Scales, displacement: Floats) -> bool:
-    """Whether any test of the monitor's own code rejects a displacement of all residuals, all scales full."""
+    """True if a test of the monitor's own code rejects a displacement of all residuals, all scales full."""
     made, every = scales.design, np.ones(METERS, dtype=np.bool_)
     for s in range(len(made.lengths)):
         here = scales[s]
