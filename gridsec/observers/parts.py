@@ -162,9 +162,14 @@ def riccati(S: Floats, t: Floats, Q: Floats, r: float, *, tol: float) -> Floats:
 
 
 def require_stable(F: Floats, what: str, *, rate: float = 1.0) -> None:
-    """Raise DesignInfeasible unless the spectral radius of F is below `rate`."""
+    """Raise DesignInfeasible unless the spectral radius of F is below `rate` by more than rounding.
+
+    Computed eigenvalues are those of a matrix within about n eps |F| of F (backward stability). A mode on the
+    circle itself is refused on every processor.
+    """
     radius = spectral_radius(F)
-    if not radius < rate:
+    rounding = len(F) * np.finfo(np.float64).eps * float(np.linalg.norm(F)) if F.size else 0.0
+    if not radius < rate - rounding:
         raise DesignInfeasible(what, f"spectral radius {radius:.6g}", rate - radius, code="unstable")
 
 
