@@ -120,6 +120,7 @@ def test_the_estimator_watches_a_simulated_feeder_as_the_page_says() -> None:
 
 
 @pytest.mark.usefixtures("installed")
+@pytest.mark.acceptance
 def test_the_estimator_is_listed_compared_with_ours_and_enters_a_campaign() -> None:
     quick = "--family neighbours --seeds 1 --duration 80 --max-attacked 1 --case bias"
     few = "--estimator neighbours --scenarios 3 --duration 30 --workers 1 --kind bias:8 --liars 1"
@@ -135,6 +136,7 @@ def test_the_estimator_is_listed_compared_with_ours_and_enters_a_campaign() -> N
     assert re.search(r"bias +│ 8 +│ 2 +│ 1 +│ 1 +│ 0 ", campaign)
 
 
+@pytest.mark.acceptance
 def test_the_estimator_serves(installed: Path) -> None:
     with serve("simbench-lv-rural1", installed, "--estimator", "neighbours") as live:
         assert live.get("/api/v1/feeders/simbench-lv-rural1/commissioning")["estimator"] == "neighbours"

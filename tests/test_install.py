@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -52,9 +53,12 @@ def names(requirements: list[str]) -> set[str]:
     return out
 
 
+parsed = cache(ast.parse)
+
+
 def imported(source: str, *, at_once: bool) -> Iterator[str]:
     """Names of the packages that a module imports: outside of functions only, or anywhere."""
-    waiting: list[ast.AST] = [ast.parse(source)]
+    waiting: list[ast.AST] = [parsed(source)]
     while waiting:
         node = waiting.pop()
         if isinstance(node, ast.Import):

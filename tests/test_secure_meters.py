@@ -88,6 +88,7 @@ def steps(folder: Path) -> Iterator[Steps]:
             process.wait(timeout=20)
 
 
+@pytest.mark.acceptance
 def test_every_step_of_the_tutorial(tmp_path: Path) -> None:
     found = BLOCK.findall(PAGE.read_text())
     assert len(found) == 11

@@ -60,6 +60,7 @@ def test_defects_are_found(changed: list[Case], told: list[str]) -> None:
         assert one in found
 
 
+@pytest.mark.canary("not acceptance")
 @pytest.mark.parametrize("tier", ["not acceptance", "acceptance"])
 def test_a_tier_is_selected_by_its_marker(tier: str) -> None:
     """By pytest in a process of its own, on a file that imports nothing of the project."""

@@ -63,6 +63,7 @@ def residuals(one: Member, run: Run, states: list[object]) -> list[Floats]:
     return [np.abs(run.r[k + run.ahead] - one.outputs(state, run.u[k + run.ahead])) for k, state in pairs]
 
 
+@pytest.mark.canary("circle-direct-line-most", "unknown-input-feeder")
 @pytest.mark.parametrize(("family", "which"), EVERY)
 def test_decays_at_the_certified_rate(family: str, which: str) -> None:
     one = member(family, which)
@@ -82,6 +83,7 @@ def test_decays_at_the_certified_rate(family: str, which: str) -> None:
     check()
 
 
+@pytest.mark.canary("circle-direct-line-most", "unknown-input-feeder")
 @pytest.mark.parametrize(("family", "which"), EVERY)
 def test_an_honest_residual_stays_inside_its_bound(family: str, which: str) -> None:
     one = member(family, which)
@@ -101,6 +103,13 @@ def test_an_honest_residual_stays_inside_its_bound(family: str, which: str) -> N
     check()
 
 
+@pytest.mark.canary(
+    "circle-direct-line-most",
+    "circle-lmi-line-few",
+    "circle-discrete-tree-direct-most",
+    "circle-discrete-sine-one",
+    "unknown-input-feeder",
+)
 @pytest.mark.parametrize(("family", "which"), EVERY)
 def test_attacks_are_visible(family: str, which: str) -> None:
     """A lie of three honest bounds breaks the bound at the liar, trusted or not; where an observer claims
@@ -133,6 +142,17 @@ def test_attacks_are_visible(family: str, which: str) -> None:
     assert listened.all(), "every member must listen to somebody"
 
 
+@pytest.mark.canary(
+    "circle-direct-line-most",
+    "circle-direct-tree-one",
+    "circle-lmi-line-few",
+    "circle-lmi-shared-few",
+    "circle-discrete-tree-direct-most",
+    "circle-discrete-shared-direct-one",
+    "circle-discrete-sine-one",
+    "kalman-modal-4",
+    "unknown-input-feeder",
+)
 @pytest.mark.parametrize(("family", "which"), EVERY)
 def test_a_masked_meter_has_exactly_no_influence(family: str, which: str) -> None:
     """Neither while it is silent nor in the step after it has come back."""
@@ -163,6 +183,13 @@ def test_a_masked_meter_has_exactly_no_influence(family: str, which: str) -> Non
                 np.testing.assert_allclose(base[deaf], one.estimates(heard)[deaf], rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.canary(
+    "circle-direct-line-most",
+    "circle-direct-tree-few",
+    "circle-direct-shared-one",
+    "circle-lmi-tree-few",
+    "circle-lmi-shared-one",
+)
 @pytest.mark.parametrize(
     ("family", "which"), [one for one in EVERY if not FAMILIES[one.values[0]].one_length]
 )
@@ -180,6 +207,7 @@ def test_long_steps_end_where_short_ones_lead(family: str, which: str) -> None:
             np.testing.assert_allclose(found, expected, atol=1e-8)
 
 
+@pytest.mark.canary("circle-direct-line", "circle-discrete-sine", "unknown-input-feeder")
 @pytest.mark.parametrize(("family", "which"), BATCHES)
 def test_many_at_once_are_the_same_as_one_by_one(family: str, which: str) -> None:
     """Steps of all lengths there are, sensors that fall silent and return."""

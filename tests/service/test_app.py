@@ -215,6 +215,7 @@ def test_a_silent_meter_is_data_loss_and_never_clean(site: Site, tmp_path: Path)
     assert verdicts[-1][1] == "clean"
 
 
+@pytest.mark.acceptance
 def test_readings_every_quarter_of_an_hour(site: Site, tmp_path: Path) -> None:
     slow = variant(site, tmp_path / "slow", tick_s=900.0, on_delay_s=0.0, off_delay_s=900.0)
     start = START - START % 900.0
@@ -315,6 +316,7 @@ def test_feeders_over_rest_have_an_end_and_stay_deleted(tmp_path: Path) -> None:
         assert names == {FEEDER, "village-0", "village-2"}
 
 
+@pytest.mark.acceptance
 def test_a_stored_feeder_that_cannot_be_loaded_any_more_is_shown_until_somebody_sees_to_it(
     tmp_path: Path,
 ) -> None:

@@ -229,6 +229,7 @@ def test_power_factor_interval_holds_the_profiles_history() -> None:
         assert row.q_floor_kvar >= history.floor * tan * row.load_kw
 
 
+@pytest.mark.acceptance
 def test_single_phase_loads_become_single_phase_customers() -> None:
     net = networks.ieee_european_lv_asymmetric("on_peak_566")
     converted = feeder_of(read_pandapower(net), "european")

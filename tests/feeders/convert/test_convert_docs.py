@@ -40,6 +40,7 @@ def test_the_example_becomes_what_the_page_shows(tmp_path: Path, monkeypatch: py
     assert out.getvalue() == printed
 
 
+@pytest.mark.acceptance
 def test_the_table_of_the_page_is_what_the_benchmark_prints(capsys: pytest.CaptureFixture[str]) -> None:
     table = [[cell.strip() for cell in line.strip("| ").split("|")] for line in PAGE.splitlines()]
     page = {(row[0], row[1]): row[2:] for row in table if len(row) == 7 and row[2].isdigit()}

@@ -107,6 +107,7 @@ def test_parallel_transformers_on_a_coupled_busbar_are_one_infeed() -> None:
     assert feeder_of(read_pandapower(net), "x", root="root 2").tables.customers[0].customer == "farm"
 
 
+@pytest.mark.acceptance
 def test_loop_is_named_and_opened_when_asked(tmp_path: Path) -> None:
     path = tmp_path / "ring.json"
     pp.to_json(village(closed=True), str(path))
@@ -275,6 +276,7 @@ def test_a_source_without_solution_is_converted_and_not_checked(tmp_path: Path) 
         check_against_source(str(path), tmp_path / "x", root="root")
 
 
+@pytest.mark.acceptance
 def test_what_is_doubtful_is_accepted_from_a_source_with_a_solution_only(tmp_path: Path) -> None:
     """Loads in kW in a column of MW: the source's own power flow has no solution."""
     path = tmp_path / "kw.json"

@@ -190,6 +190,7 @@ def test_notes_say_what_was_ignored_and_fused() -> None:
     assert any("without a meter: miller" in note for note in unmetered)
 
 
+@pytest.mark.acceptance
 @given(feeders())
 def test_valid_tables_round_trip(tables: FeederTables) -> None:
     assert validate(tables) == ()

@@ -246,6 +246,7 @@ def test_forecasts_make_reconstructions_better_and_say_how_good_they_are(site: S
     assert 0.5 < rms(ratios) < 1.5
 
 
+@pytest.mark.canary("900.0-7200.0-cigre")
 @pytest.mark.parametrize("site", [CIGRE, RURAL], ids=["cigre", "rural1"])
 @pytest.mark.parametrize(("tick_s", "duration_s"), [(1.0, 60.0), (900.0, 7200.0)])
 def test_nobody_honest_is_named(site: Site, tick_s: float, duration_s: float) -> None:

@@ -152,6 +152,7 @@ def test_an_unchanged_power_has_the_age_of_its_first_reading(site: Site) -> None
     assert all(untold.apply(replace(said(site), t=T + k)).p_age_s is None for k in range(100))
 
 
+@pytest.mark.acceptance
 def test_stuck_registers_are_never_clean_for_long_and_empty_houses_cost_nothing() -> None:
     """All registers stuck from the third minute on: no voltage beside them is a check of its own."""
     seen, _, of_bound = unchanged(0, 600, "stuck", 57)

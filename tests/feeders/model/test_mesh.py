@@ -151,6 +151,7 @@ def outcome(
     return judge(design(trial.stated), trial, settling_s=3.0)
 
 
+@pytest.mark.canary("landnetz-together--2.0")
 @pytest.mark.parametrize(
     ("make", "trick", "percent"),
     [
@@ -173,6 +174,7 @@ def test_a_third_of_the_meters_lies_and_nobody_else_is_named(
     assert np.percentile(found.error_all, 95) < 0.1
 
 
+@pytest.mark.canary("landnetz-white")
 @pytest.mark.parametrize(
     ("make", "meters"),
     [

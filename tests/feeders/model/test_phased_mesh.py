@@ -180,6 +180,7 @@ def test_customers_of_three_phases_alone_are_the_balanced_mesh() -> None:
 # --- the model against the power flow -----------------------------------------------------------
 
 
+@pytest.mark.canary("village")
 @pytest.mark.parametrize("make", [european, ring, village])
 @given(seed=st.integers(0, 1000), load=st.sampled_from([0.1, 0.5, 1.0]))
 @settings(max_examples=6, deadline=None)
@@ -200,6 +201,7 @@ def test_the_power_flow_is_within_the_bound(make: Callable[[], Site], seed: int,
     np.testing.assert_allclose(feeder.bus_voltages(p, q, v0**2, steps=40), exact, rtol=0, atol=1e-9)
 
 
+@pytest.mark.acceptance
 def test_the_european_feeder_with_a_ring() -> None:
     """At full load |v| is within 0.1 %; the matrices are the derivatives of the AC power flow."""
     site = european()

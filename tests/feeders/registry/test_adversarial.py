@@ -254,6 +254,26 @@ def test_wide_load_intervals_on_a_long_feeder(monkeypatch: pytest.MonkeyPatch) -
         watch.look()
 
 
+@pytest.mark.canary(
+    "cigre-lv-0.955-ends0-load-True",
+    "cigre-lv-0.955-ends1-sun-True",
+    "cigre-lv-0.99-ends0-sun-False",
+    "cigre-lv-1.03-ends0-load-False",
+    "cigre-lv-1.03-ends1-sun-True",
+    "cigre-lv-1.045-ends1-load-True",
+    "kerber-landnetz-0.955-ends0-sun-True",
+    "kerber-landnetz-0.955-ends1-sun-False",
+    "kerber-landnetz-0.99-ends1-load-False",
+    "kerber-landnetz-1.03-ends0-sun-True",
+    "kerber-landnetz-1.045-ends0-load-True",
+    "kerber-landnetz-1.045-ends1-load-False",
+    "case33bw-0.955-ends0-sun-False",
+    "case33bw-0.99-ends0-load-False",
+    "case33bw-0.99-ends1-sun-True",
+    "case33bw-1.03-ends1-load-True",
+    "case33bw-1.045-ends0-load-False",
+    "case33bw-1.045-ends1-sun-False",
+)
 @pytest.mark.parametrize("bank", [True, False])
 @pytest.mark.parametrize("jump", ["load", "sun"])
 @pytest.mark.parametrize("ends", [HIGH, LOW])

@@ -46,6 +46,7 @@ def put(frame: Frame, name: str, value: float) -> Frame:
     return frame
 
 
+@pytest.mark.canary("p-basis-pursuit", "q_net_error-windowed-bank")
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("what", ["p", "p_error", "q", "q_error", "q_net", "q_net_error"])
 def test_a_power_that_is_none_is_not_known(name: str, what: str) -> None:
@@ -66,6 +67,7 @@ def test_a_power_that_is_none_is_not_known(name: str, what: str) -> None:
                 assert verdict.decision is (then if k >= BEFORE else known), (value, k)
 
 
+@pytest.mark.canary("basis-pursuit", "windowed-bank")
 @pytest.mark.parametrize("name", NAMES)
 def test_a_voltage_that_is_none_is_a_lie_of_one_meter(name: str) -> None:
     for value in (-1.0, 1e300):

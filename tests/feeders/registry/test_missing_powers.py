@@ -128,6 +128,7 @@ def test_colluding_meters_that_withhold_powers_are_never_clean_beyond_the_bound(
     assert max(off) < 4.0
 
 
+@pytest.mark.canary("late")
 @pytest.mark.parametrize("how", [absurd, beyond, late])
 def test_powers_that_are_worth_nothing_are_as_good_as_withheld_ones(
     how: Callable[[Snapshot, Bools], Snapshot],
@@ -141,6 +142,7 @@ def test_powers_that_are_worth_nothing_are_as_good_as_withheld_ones(
             assert (wrong <= 4.0 * estimate.std).all()
 
 
+@pytest.mark.canary("1-0")
 @pytest.mark.parametrize(("count", "seed"), [(1, 0), (1, 1), (1, 2), (5, 3), (LIARS, 4)])
 def test_withheld_powers_of_honest_meters_accuse_nobody(count: int, seed: int) -> None:
     for sample, estimate, verdict in watch(seed, street(count, seed), lying=False):

@@ -36,6 +36,7 @@ def test_every_name_that_a_file_may_hold_has_a_family() -> None:
     assert all(family.summary for family in FAMILIES.values())
 
 
+@pytest.mark.canary("sequential", "unknown-input")
 @pytest.mark.parametrize("name", [name for name in ESTIMATORS if name != LMI])
 def test_an_estimator_watches_three_phases(name: str) -> None:
     site = choose(from_tables(unbalanced(SMALL)), estimator=name)
@@ -97,6 +98,7 @@ def test_the_load_columns_are_what_power_flow_does_to_the_voltage() -> None:
         np.testing.assert_allclose(columns[:, j] / dp[j], (rest - moved) / 0.01, rtol=0.02, atol=1e-6)
 
 
+@pytest.mark.canary("exact-bank")
 @pytest.mark.parametrize("estimator", [DIRECT, LMI])
 def test_both_name_exactly_the_liar(estimator: str, tmp_path: Path) -> None:
     site = choose(load(SMALL), estimator=estimator)

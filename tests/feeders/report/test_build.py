@@ -177,6 +177,7 @@ def test_all_tables_and_figures_are_there_as_files(made: Report, outcomes: list[
             assert data.startswith(b"\x89PNG")
 
 
+@pytest.mark.acceptance
 def test_the_same_studies_give_the_same_bytes(site: Site, outcomes: list[StudyOutcome], made: Report) -> None:
     again = report(site, outcomes[:2], ABOUT)
     assert again.html == report(site, outcomes[:2], ABOUT).html

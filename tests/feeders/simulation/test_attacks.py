@@ -34,6 +34,9 @@ CONSTANT = (
 )
 
 
+@pytest.mark.canary(
+    "1-bias", "1-coordinated", "2-scaling", "2-coordinated", "3-scaling", "3-coordinated-power"
+)
 @pytest.mark.parametrize("kind", CONSTANT)
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_every_manipulated_meter_is_moved_by_at_least_the_size(kind: AttackKind, count: int) -> None:

@@ -73,6 +73,7 @@ def test_agrees_with_pandapower(name: str) -> None:
     np.testing.assert_array_equal(customers, volts[grid.customer_bus])
 
 
+@pytest.mark.canary("cigre-lv")
 @pytest.mark.parametrize("name", NETWORKS)
 def test_currents_balance_at_every_bus(name: str) -> None:
     grid, net, buses = solved_pandapower(*NETWORKS[name])

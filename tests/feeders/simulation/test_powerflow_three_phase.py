@@ -57,6 +57,7 @@ def test_agrees_with_pandapower(scenario: str) -> None:
     np.testing.assert_allclose(volts / nominal, expected, rtol=0, atol=1e-5)
 
 
+@pytest.mark.canary("kerber-landnetz-ends3")
 @pytest.mark.parametrize(
     ("name", "ends"),
     [

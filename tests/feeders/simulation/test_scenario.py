@@ -63,6 +63,7 @@ def test_every_tick_solves_the_power_flow(site: Site) -> None:
         np.testing.assert_allclose(sample.v_bus_volt, buses, rtol=1e-10)
 
 
+@pytest.mark.canary("case33bw", "simbench-lv-rural3")
 @pytest.mark.parametrize("name", names())
 def test_power_is_conserved_on_every_feeder(name: str) -> None:
     """What the busbar feeds in is what customers draw and lines lose, from phasors alone."""

@@ -51,6 +51,7 @@ def test_sizes_are_in_order(cigre: Detectable) -> None:
     assert (cigre.customers[["error", "error_fits"]] > 0.0).all(axis=None)
 
 
+@pytest.mark.acceptance
 def test_the_monitor_keeps_what_is_promised_on_a_small_feeder(cigre: Detectable) -> None:
     assert rehearse(CIGRE, cigre, trials=40, seed=3) == Rehearsal(40, 0, 0, 0)
 
@@ -84,6 +85,7 @@ def test_an_interrupted_study_goes_on(cigre: Detectable, tmp_path: Path) -> None
     pd.testing.assert_frame_equal(again.customers, cigre.customers)
 
 
+@pytest.mark.acceptance
 def test_processes_find_the_same_to_the_last_bit(cigre: Detectable) -> None:
     found = detectable(CIGRE, max_attacked=2, runner=Processes(2))
     pd.testing.assert_frame_equal(found.meters, cigre.meters, check_exact=True)

@@ -30,6 +30,7 @@ def agrees(site: Site, unknown: list[str] | None, silent: list[str]) -> None:
         assert meters.loc[site.meter_ids[j], "critical"] == (own == 1)
 
 
+@pytest.mark.canary("0", "3", "6", "10", "13", "16", "19")
 @pytest.mark.parametrize("seed", range(20))
 def test_streets_without_some_meters_equal_exact_ranks(seed: int) -> None:
     site = two_streets(seed)

@@ -71,6 +71,7 @@ def test_lies_of_the_noticed_size_are_noticed_and_hidden_ones_are_not(found: Det
             assert not watched(watcher, CIGRE, seed, hidden[j] * unit)[0]
 
 
+@pytest.mark.acceptance
 def test_errors_are_covered_where_nobody_meters(found: Detectable) -> None:
     """Lies from nothing to the noticed size, as long as they are not noticed."""
     watcher, base = design(CIGRE), CIGRE.customer_volt[CIGRE.meters]

@@ -97,6 +97,7 @@ def assert_central(site: Site, posts: list[Concentrator], expected: dict[str, Fl
         assert found.readings == int(expected["used"])
 
 
+@pytest.mark.canary("simbench-lv-rural1-4")
 @pytest.mark.parametrize(
     ("name", "customers"), [("simbench-lv-rural1", 4), ("kerber-dorfnetz", 10), ("kerber-vorstadtnetz", 12)]
 )
@@ -135,6 +136,7 @@ def manipulated(y: Floats, seed: int, part: float, size: float) -> tuple[Floats,
     return y + np.where(liars, size * rng.choice([-1.0, 1.0], y.size), 0.0), liars
 
 
+@pytest.mark.canary("0")
 @pytest.mark.parametrize("seed", range(6))
 def test_meters_are_those_that_a_central_search_names(seed: int) -> None:
     site, areas, noise = cut("kerber-dorfnetz", 8)
@@ -221,6 +223,7 @@ def test_lying_end_leaves_two_explanations_and_the_others_right() -> None:
     assert (again.decision, again.concentrators) == (Decision.CLEAN, ())
 
 
+@pytest.mark.canary("1000000000.0")
 @pytest.mark.parametrize("claim", [0.0, 1e9])
 def test_claimed_information_moves_a_neighbour_by_less_than_the_limit(claim: float) -> None:
     """Any message that is not disputed leaves the truth within the limit of the receiver's own prediction."""

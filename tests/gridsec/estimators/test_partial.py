@@ -383,6 +383,7 @@ class TestDesign:
 
 
 class TestFeeders:
+    @pytest.mark.canary("cigre-lv-0.06-5")
     @pytest.mark.parametrize(
         ("name", "size", "seed"), [(SMALL, 0.06, 5), (RURAL, -0.03, 1), (RURAL, 0.02, 2)]
     )
@@ -403,6 +404,7 @@ class TestFeeders:
         assert decisions[Decision.ATTACKED] == 29
         assert decisions[Decision.CLEAN] >= 20
 
+    @pytest.mark.canary("900.0")
     @pytest.mark.parametrize("dt_s", [15.0, 900.0])
     def test_hours_without_liars(self, dt_s: float) -> None:
         """An hour every 15 s, half a day every quarter of an hour: nobody is named, and it settles."""

@@ -25,6 +25,7 @@ from tests.gridsec.watching import watcher
 watch = watcher(set_search, lambda _made, _state, verdict, honest: verdict.suspects[honest])
 
 
+@pytest.mark.acceptance
 @settings(max_examples=30)
 @given(
     seed=st.integers(0, 2**32 - 1),

@@ -113,6 +113,7 @@ def test_finds_the_best_of_all_sets_of_up_to_three(seed: int) -> None:
     assert sum(rivals.values()) == pytest.approx(1.0)
 
 
+@pytest.mark.canary("True")
 @pytest.mark.parametrize("like_a_load", [False, True])
 def test_lies_that_are_alike_are_found_where_they_are_weak(like_a_load: bool) -> None:
     """Lies of three to seven standard deviations: the best of all sets, of all shapes, is found."""

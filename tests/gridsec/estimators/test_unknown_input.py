@@ -81,6 +81,7 @@ def named(verdict: Verdict) -> tuple[list[int], list[int]]:
     return np.flatnonzero(verdict.suspects).tolist(), np.flatnonzero(verdict.inverters).tolist()
 
 
+@pytest.mark.canary("0.05")
 @pytest.mark.parametrize("lie", [0.05, -0.03])
 def test_a_lying_meter_and_a_wrong_inverter_are_both_named_exactly(lie: float) -> None:
     site = village()
@@ -130,6 +131,7 @@ def test_only_an_inverter_whose_meter_might_as_well_lie_is_ambiguous() -> None:
     assert sum(e.probability for e in last.explanations) == pytest.approx(1.0)
 
 
+@pytest.mark.canary("cigre-lv-0--95.0")
 @pytest.mark.parametrize(
     ("name", "inverter", "kvar"),
     [

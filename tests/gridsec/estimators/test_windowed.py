@@ -44,6 +44,7 @@ def make(
 watch = watcher(windowed, None)
 
 
+@pytest.mark.acceptance
 @settings(max_examples=25)
 @given(
     seed=st.integers(0, 2**32 - 1),

@@ -54,6 +54,14 @@ def oracle(design: circle.CircleDesign, x: np.ndarray, y: np.ndarray, u: np.ndar
     return np.asarray(run.y[:, -1])
 
 
+@pytest.mark.canary(
+    "direct-0.05-line",
+    "direct-1.0-shared",
+    "lmi-0.05-tree",
+    "lmi-10.0-tree",
+    "hand-1.0-line",
+    "hand-10.0-shared",
+)
 @pytest.mark.parametrize("of", [line(5), tree(), shared()], ids=["line", "tree", "shared"])
 @pytest.mark.parametrize("h", [0.05, 1.0, 10.0])
 @pytest.mark.parametrize("kind", ["direct", "lmi", "hand"])

@@ -105,6 +105,7 @@ def spoil(designs: tuple[CircleGains, ...], **change: Any) -> list[CircleGains]:
     return [designs[0], replace(designs[1], **change), *designs[2:]]
 
 
+@pytest.mark.canary("<lambda>-cannot be read0", "<lambda>-another size")
 @pytest.mark.parametrize(
     ("damage", "why"),
     [

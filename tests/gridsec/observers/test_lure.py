@@ -80,6 +80,7 @@ def test_known_input_in_batches() -> None:
     )
 
 
+@pytest.mark.canary("0.01", "900.0")
 @pytest.mark.parametrize("h", [0.01, 0.1, 1.0, 7.0, 30.0, 59.0, 61.0, 900.0])
 @settings(max_examples=12)
 @given(seed=seeds, gain=gains, spread=st.sampled_from([1.0, 4.0]))
@@ -177,6 +178,7 @@ def test_long_steps_take_the_equilibrium_and_the_change_is_seamless() -> None:
     )
 
 
+@pytest.mark.canary("0.5")
 @pytest.mark.parametrize("h", [0.5, 20.0, 900.0])
 @settings(max_examples=12)
 @given(seed=seeds, gain=st.sampled_from([0.3, 0.9, 2.0]))

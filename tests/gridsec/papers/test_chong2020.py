@@ -28,6 +28,7 @@ def result() -> Reproduction:
 
 
 class TestSetting:
+    @pytest.mark.acceptance
     def test_every_claim_is_met_or_explained(self, result: Reproduction) -> None:
         assert not result.unexplained
         assert [claim.where for claim in result.unmet] == ["(8) (erratum)", "(8) (erratum)"]

@@ -35,6 +35,7 @@ def test_every_claim_that_is_not_met_has_a_reason() -> None:
             assert [line.label for line in panel.lines] == ["truth", "estimate"]
 
 
+@pytest.mark.canary("10.0-False")
 @pytest.mark.parametrize("corrected", [False, True])
 @pytest.mark.parametrize("amplitude", [1.0, 10.0])
 def test_the_figures_come_out_for_ten_seeds(amplitude: float, corrected: bool) -> None:

@@ -48,6 +48,7 @@ def tried(given: PowerErrorModel, meter: int, liars: int, honest: Bools) -> floa
     return best
 
 
+@pytest.mark.canary("0", "11")
 @pytest.mark.parametrize("seed", range(12))
 def test_largest_stories_equal_enumeration(seed: int) -> None:
     given = stories(seed, 4)
@@ -78,6 +79,7 @@ def test_with_true_powers_it_is_the_lie_alone() -> None:
         assert largest_story(true, j, 2).size == pytest.approx(largest_lie(true.box, j, 2).size)
 
 
+@pytest.mark.canary("0", "19")
 @pytest.mark.parametrize("seed", range(20))
 def test_protection_against_stories_equals_brute_force(seed: int) -> None:
     given, liars = stories(300 + seed, 4), 1 + seed % 3

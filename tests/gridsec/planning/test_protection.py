@@ -35,6 +35,7 @@ def check(attacker: Attacker, p: int, fewest: int) -> None:
     assert greedy.gap == greedy.meters.size - greedy.least
 
 
+@pytest.mark.canary("0-False", "11-False", "21-False", "32-False", "43-False", "3-True", "14-True")
 @pytest.mark.parametrize(
     ("seed", "phased"),
     [*((seed, False) for seed in range(50)), *((seed, True) for seed in range(15))],
@@ -51,6 +52,7 @@ def test_protection_against_imitators_equals_brute_force(seed: int, phased: bool
     check(hides(found, liars), p, found_by_hand(safe))
 
 
+@pytest.mark.canary("41")
 @pytest.mark.parametrize("seed", range(50))
 def test_protection_against_large_lies_equals_brute_force(seed: int) -> None:
     box, liars = street(200 + seed, meters=4), 1 + seed % 3

@@ -40,6 +40,24 @@ FEEDERS = pytest.mark.parametrize(
 """Balanced feeders, and some in three phases."""
 
 
+@pytest.mark.canary(
+    "0-False-True",
+    "2-False-False",
+    "4-False-False",
+    "7-False-True",
+    "9-False-True",
+    "11-False-False",
+    "14-False-True",
+    "16-False-True",
+    "18-False-False",
+    "20-False-False",
+    "23-False-True",
+    "0-True-False",
+    "2-True-False",
+    "5-True-True",
+    "7-True-True",
+    "9-True-False",
+)
 @pytest.mark.parametrize("persistent", [True, False])
 @FEEDERS
 def test_indices_of_all_and_of_each_meter_equal_brute_force(

@@ -36,6 +36,7 @@ def tried(box: ErrorBox, row: Floats, liars: int, honest: Floats, must: int | No
     return best
 
 
+@pytest.mark.canary("1")
 @pytest.mark.parametrize("seed", range(6))
 def test_largest_lies_equal_enumeration(seed: int) -> None:
     box = street(seed, meters=4)

@@ -155,6 +155,7 @@ def test_theorem_1_whoever_lies(inputs: tuple[int, ...], sensor: int) -> None:
     np.testing.assert_allclose(last.sensor_attack, a_y[-1], atol=1e-8)
 
 
+@pytest.mark.canary("0-0", "2-3")
 @pytest.mark.parametrize(("actuator", "sensor"), list(itertools.product(range(3), range(4))))
 def test_theorem_2_whoever_lies(actuator: int, sensor: int) -> None:
     """Named as soon as the certified bounds are small enough, which takes longer than the estimate does."""
@@ -171,6 +172,7 @@ def test_theorem_2_whoever_lies(actuator: int, sensor: int) -> None:
     np.testing.assert_allclose(last.sensor_attack, a_y[-1], atol=1e-6)
 
 
+@pytest.mark.canary("1")
 @pytest.mark.parametrize("example", [1, 2])
 def test_the_printed_selection_errs_at_most_three_times_as_much_as_the_honest_members(example: int) -> None:
     """Theorems 1 and 2 with the selection of (5) to (7), (22) to (24): (15) and (32) at every step."""

@@ -215,6 +215,7 @@ class TestRules:
 class TestPropositions:
     """Example 1 with proven gains. e(0) = 0, hence epsilon = 0 and k* = 0, as in the paper."""
 
+    @pytest.mark.acceptance
     @settings(max_examples=25, deadline=None)
     @given(seed=SEEDS, tau=st.floats(0.05, 1.0), liars=st.sampled_from([1, 2]))
     def test_1_and_3_small_attacks_stay_unseen(self, seed: int, tau: float, liars: int) -> None:
@@ -498,6 +499,7 @@ def village() -> tuple[object, np.ndarray, np.ndarray]:
 
 
 class TestFeeder:
+    @pytest.mark.canary("0.03-1")
     @pytest.mark.parametrize(("size", "q"), [(0.0, 1), (0.03, 1), (-0.03, 2), (1e3, 2)])
     def test_proven_thresholds_on_sampled_readings(
         self, village: tuple[object, np.ndarray, np.ndarray], size: float, q: int

@@ -42,6 +42,7 @@ def test_version(monkeypatch: Patch, capsys: Capture) -> None:
     assert command()(monkeypatch, capsys, "--version") == (0, f"gridsec {metadata.version('gridsec')}\n", "")
 
 
+@pytest.mark.acceptance
 def test_a_service_without_a_feeder_names_the_ways_to_add_one(tmp_path: Path) -> None:
     with subprocess.Popen(
         [*COMMAND, "serve", "--zenoh-listen", f"tcp/127.0.0.1:{free_port()}", "--http", "127.0.0.1:0",

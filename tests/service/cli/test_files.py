@@ -148,6 +148,7 @@ def test_a_report_takes_limits_of_the_busbar_and_a_preset(
         assert f"{option}: expected two ascending" in plain(error)
 
 
+@pytest.mark.acceptance
 def test_a_report_tells_what_its_attacks_take_from_the_files(
     rare: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -166,6 +166,7 @@ def test_sigterm_ends_all_processes_of_a_campaign_and_it_goes_on(
     assert not list(cache.iterdir())
 
 
+@pytest.mark.acceptance
 def test_an_interruption_while_processes_begin_is_one_line(cache: Path) -> None:
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen([*GRIDSEC, *CAMPAIGN], text=True, start_new_session=True, **pipes) as first:

@@ -234,6 +234,7 @@ def test_it_can_be_read_on_a_desk_on_a_phone_and_on_paper(
 
 
 @pytest.mark.browser
+@pytest.mark.acceptance
 def test_tables_sort_and_the_summary_is_one_page_of_paper(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

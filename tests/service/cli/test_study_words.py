@@ -108,6 +108,7 @@ def test_detectable(given: Given) -> None:
     assert f"V ({customers['customer'][customers['error'].argmax()]})." in ran.end
 
 
+@pytest.mark.acceptance
 def test_droop(given: Given) -> None:
     few = ("--compare", "vde4105", "--tau-factor", "1", "--hosting", "--draws", "1", "--band", "0.97", "1.03")
     ran = Ran(*given, "droop", "cigre-lv", *few)

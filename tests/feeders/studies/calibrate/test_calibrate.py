@@ -58,6 +58,7 @@ def test_clean_recordings_lead_to_no_proposal_and_intervals_cover(tmp_path: Path
     assert np.mean(powers) > 0.7
 
 
+@pytest.mark.acceptance
 def test_three_planted_errors_are_found_and_nothing_else(tmp_path: Path) -> None:
     wrong = moved(swapped(TABLES, "Load R11", "Load R16"), "Load R15", "Bus R17")
     wrong = shortened(wrong, "Line R6-R16", 1.3)

@@ -160,6 +160,7 @@ def test_channels_of_a_meter_of_three_phases_are_read_as_the_meter(tmp_path: Pat
             frames(three_phase(tables), table.replace({"meter": renamed}))
 
 
+@pytest.mark.canary("s5-c")
 @pytest.mark.parametrize(("bus", "said"), [("s1", "a"), ("s5", "c")])
 def test_a_customer_on_a_service_line_of_another_phase_is_found_and_no_meter_excluded(
     bus: str, said: str

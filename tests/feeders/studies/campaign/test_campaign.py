@@ -381,6 +381,7 @@ def threads(_: int) -> list[int]:
     return [library["num_threads"] for library in threadpoolctl.threadpool_info()]
 
 
+@pytest.mark.acceptance
 def test_processes_compute_with_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the environment says: sums of several threads have other last bits."""
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
@@ -420,6 +421,7 @@ def test_whoever_stops_listening_stops_the_processes() -> None:
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.acceptance
 def test_a_dask_cluster_gives_the_same_also_when_a_worker_is_killed(here: Campaign) -> None:
     distributed = pytest.importorskip("distributed")
     killed: list[int] = []

@@ -64,6 +64,7 @@ def test_a_box_from_saturation_is_never_left_and_one_from_an_ellipsoid_can_be() 
 NUMBERS = np.array([0.0, -1.0, 1e3, -1e3, 1e10, 1e100, -1e100, 1e200, 1e300, 5e-324])
 
 
+@pytest.mark.canary("y", "q_error", "v0_squared")
 @pytest.mark.parametrize("field", ["y", "p", "q", "p_error", "q_error", "q_net", "q_net_error", "v0_squared"])
 def test_absurd_numbers_give_finite_answers_and_are_forgotten(field: str) -> None:
     rng = np.random.default_rng(7)

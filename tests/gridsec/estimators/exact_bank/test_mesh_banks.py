@@ -24,6 +24,7 @@ def test_a_set_of_liars_is_named_and_nobody_else(liars: tuple[int, ...]) -> None
     assert all(lied(street, design, exact_bank, liars, 11))
 
 
+@pytest.mark.canary("None-gridsec.estimators.windowed", "5-gridsec.estimators.unknown_input")
 @pytest.mark.parametrize("family", [windowed, set_search, partial, unknown_input])
 @pytest.mark.parametrize("liar", [None, 0, 5])
 def test_other_families_name_the_liar_alone(family: ModuleType, liar: int | None) -> None:
@@ -49,6 +50,7 @@ def test_other_families_name_the_liar_alone(family: ModuleType, liar: int | None
         assert verdict.decision is (Decision.UNDECIDED if family is unknown_input else Decision.CLEAN)
 
 
+@pytest.mark.canary("0", "8")
 @pytest.mark.parametrize("seed", range(9))
 def test_random_streets_with_errors_at_their_ends(seed: int) -> None:
     """Any spacing of readings, lost readings, metered reactive power, unequal phases, lies that jump."""

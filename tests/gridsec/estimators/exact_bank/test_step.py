@@ -17,6 +17,7 @@ from tests.gridsec.watching import decisions, watch
 
 
 class TestHonestStreets:
+    @pytest.mark.acceptance
     @settings(max_examples=25)
     @given(
         seed=st.integers(0, 2**32 - 1),

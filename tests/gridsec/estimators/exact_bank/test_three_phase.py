@@ -177,6 +177,7 @@ def lied(
 
 
 class TestCoupledPhases:
+    @pytest.mark.canary("liars0", "liars7", "liars14", "liars20", "liars27")
     @pytest.mark.parametrize("liars", [liars for k in (1, 2) for liars in combinations(range(7), k)])
     def test_every_set_of_liars_is_named_and_nobody_else(self, liars: tuple[int, ...]) -> None:
         rng = np.random.default_rng(liars)
@@ -185,6 +186,7 @@ class TestCoupledPhases:
         design = exact_bank.design(plant, max_attacked=2, step_s=1.0)
         assert all(lied(street, design, exact_bank, liars, 11))
 
+    @pytest.mark.canary("None-gridsec.estimators.windowed", "5-gridsec.estimators.unknown_input")
     @pytest.mark.parametrize("family", [windowed, set_search, partial, unknown_input])
     @pytest.mark.parametrize("liar", [None, 0, 5])
     def test_other_families_name_the_liar_alone(self, family: ModuleType, liar: int | None) -> None:
@@ -237,6 +239,7 @@ class TestCoupledPhases:
         # The others keep theirs.
         assert verdict.threshold[~here].max() < verdict.threshold[here].min()
 
+    @pytest.mark.canary("gridsec.estimators.exact_bank")
     @pytest.mark.parametrize("family", [exact_bank, windowed, set_search, partial, unknown_input])
     def test_absurd_frames_get_an_answer(self, family: ModuleType) -> None:
         plant = coupled(2)
@@ -259,6 +262,7 @@ class TestCoupledPhases:
         again = family.step(design, state, frame)[2]
         assert again.decision is Decision.UNDECIDED
 
+    @pytest.mark.canary("0", "17")
     @pytest.mark.parametrize("seed", range(18))
     def test_random_streets_with_errors_at_their_ends(self, seed: int) -> None:
         """Any spacing of readings, lost readings, metered reactive power, unequal phases, lies that jump."""

@@ -45,6 +45,7 @@ def test_scores_and_means_equal_those_of_the_dense_filter(make: object, kind: st
     assert np.allclose(made.U @ joint.score, found.score)
 
 
+@pytest.mark.canary("late")
 @pytest.mark.parametrize("kind", [*KINDS, "late"])
 def test_one_meter_is_named_with_missing_readings(kind: str) -> None:
     """A step of 1 % names this meter and no other; "late": readings are missing after the alarm only."""

@@ -19,9 +19,7 @@ RUNS = [
 
 @pytest.mark.canary(
     "majority-14",
-    "phases-busbar-0",
     "phases-lateral-93",
-    "drift-38",
     "contiguous-low-0",
     "false-power-1",
 )

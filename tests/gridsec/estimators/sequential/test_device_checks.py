@@ -143,6 +143,7 @@ class TestOneMore:
 
 
 class TestStreets:
+    @pytest.mark.canary("-0.03")
     @pytest.mark.parametrize("part", [0.03, -0.03, 0.012])
     def test_it_is_named_and_nobody_else_and_believed_again(self, part: float) -> None:
         road, design = street(1)
@@ -176,6 +177,7 @@ class TestStreets:
         assert verdict.reason.endswith("; and the meter of the busbar.")
         assert not any(np.delete(verdict.suspects, list(lies)).any() for _, verdict in answers)
 
+    @pytest.mark.canary("0.015")
     @pytest.mark.parametrize("part", [0.03, 0.015])
     def test_many_who_lie_alike_do_not_make_it_a_liar(self, part: float) -> None:
         road, design = street(5)

@@ -49,6 +49,7 @@ def put(name: str, value: float) -> Change:
 
 
 class TestNumbersThatAreNone:
+    @pytest.mark.canary("q-1e+308")
     @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e20, -1e200, 1e308])
     @pytest.mark.parametrize("name", ["p", "q", "p_error", "q_error"])
     def test_a_power_that_is_none_is_not_known(self, name: str, value: float) -> None:
@@ -58,6 +59,7 @@ class TestNumbersThatAreNone:
         assert verdicts[-1].decision is Decision.CLEAN
         assert (state.uncertainty.p == 1.0).all()
 
+    @pytest.mark.canary("100000000.0")
     @pytest.mark.parametrize("value", [-1e308, 0.0, 1e8, 1e15, 1e200, 1e308])
     def test_a_reading_that_is_none_is_a_lie_of_one_meter(self, value: float) -> None:
         verdicts, _ = run(put("y", value), frames=4, after=70)
@@ -65,6 +67,7 @@ class TestNumbersThatAreNone:
         assert not any(np.delete(verdict.suspects, 2).any() for verdict in verdicts)
         assert verdicts[-1].decision is Decision.CLEAN
 
+    @pytest.mark.canary("0")
     @pytest.mark.parametrize("inverters", [0, 5])
     def test_everything_at_once(self, inverters: int) -> None:
         """Half of the meters silent, another half at every tick; powers and the busbar come and go."""

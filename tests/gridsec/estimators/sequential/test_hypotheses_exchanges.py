@@ -60,6 +60,7 @@ def watched(
     return told
 
 
+@pytest.mark.canary("False-7")
 @pytest.mark.parametrize("liar", BOTH)
 @pytest.mark.parametrize("together", [True, False])
 def test_which_of_two_neighbours_it_is_is_not_guessed(liar: int, *, together: bool) -> None:

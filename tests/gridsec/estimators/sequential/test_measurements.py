@@ -160,6 +160,7 @@ def test_a_meter_with_an_offset_that_no_scale_judges_is_neither_clean_nor_accuse
     assert np.isnan(said[-1].score[6])
 
 
+@pytest.mark.canary("4.0")
 @pytest.mark.parametrize("offset", [-2.0, 4.0])
 def test_tap_steps_accuse_no_busbar_with_a_measured_offset(offset: float) -> None:
     """Right clocks of the meters. Without the offset the busbar's meter is named."""

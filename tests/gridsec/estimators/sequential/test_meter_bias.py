@@ -323,6 +323,7 @@ class TestStreets:
         assert again.learning is None
         assert (np.isfinite(again.learned.at)).all()
 
+    @pytest.mark.acceptance
     def test_a_replaced_meter_is_named_until_it_is_learned_anew(self) -> None:
         """The new meter is within its class, but not where the old one was."""
         rng = np.random.default_rng(12)

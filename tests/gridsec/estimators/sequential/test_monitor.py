@@ -85,6 +85,7 @@ def test_a_single_long_scale_answers_at_every_tick() -> None:
 
 
 class TestHonestStreets:
+    @pytest.mark.acceptance
     @settings(max_examples=15, deadline=None)
     @given(
         seed=st.integers(0, 2**32 - 1),

@@ -247,6 +247,7 @@ class TestTheEuropeanFeeder:
         assert verdict.decision is Decision.ATTACKED
         assert np.mean(inside) > 0.999
 
+    @pytest.mark.acceptance
     def test_without_a_phase_of_the_busbar_that_phase_is_known_less_well(self) -> None:
         this = self.trial(None, 20.0)
         watcher = design_site(this.stated)

@@ -76,6 +76,7 @@ def test_no_set_explains_better_and_the_liars_are_it(seed: int) -> None:
     assert tuple(np.flatnonzero(~found.posterior.trusted)) == which == tuple(suspects)
 
 
+@pytest.mark.canary("False-0", "False-6", "True-3", "True-9")
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize("one_way", [False, True])
 def test_a_third_of_the_meters_in_collusion(seed: int, one_way: bool) -> None:

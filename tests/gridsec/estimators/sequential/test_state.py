@@ -55,6 +55,7 @@ def test_liars_stay_named_and_are_forgotten_when_they_stop(begun: tuple[Sequenti
     assert answers[-1][1].decision is Decision.CLEAN
 
 
+@pytest.mark.canary("5.0-4-False", "70.0-48-True")
 @pytest.mark.parametrize("named", [False, True])
 @pytest.mark.parametrize(("scale_s", "readings"), [(5.0, 4), (15.0, 12), (70.0, 48)])
 def test_a_scale_speaks_for_a_meter_once_it_has_readings_enough(
@@ -106,6 +107,7 @@ def _high(percent: float) -> object:
     return lambda frame: replace(frame, v0_squared=frame.v0_squared * (1.0 + percent / 100.0) ** 2)
 
 
+@pytest.mark.canary("60.0-0.75-False")
 @pytest.mark.parametrize("named", [False, True])
 @pytest.mark.parametrize(("scale_s", "percent"), [(1.0, 3.0), (60.0, 0.75), (60.0, -0.8)])
 def test_a_busbar_that_goes_on_lying_is_not_believed_again(

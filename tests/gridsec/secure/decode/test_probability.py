@@ -47,6 +47,7 @@ def test_the_series_errs_downwards_and_little(spread: float) -> None:
     assert quadratic_probability(values, 2.0 * spread, tol=1e-2) <= got + 1e-12
 
 
+@pytest.mark.canary("0.001-0.01", "0.5-0.01", "3.0-0.01", "3.0-1e-30", "40.0-1e-30", "1000000000.0-1e-30")
 @pytest.mark.parametrize("small", [1e-2, 1e-3, 1e-4, 1e-8, 1e-30])
 @pytest.mark.parametrize("limit", [1e-3, 0.5, 3.0, 40.0, 1e9])
 def test_weights_of_very_different_size(small: float, limit: float) -> None:
