@@ -7,6 +7,7 @@ import json
 from dataclasses import asdict
 from typing import Annotated, Any
 
+import structlog
 from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import JSONResponse
@@ -20,6 +21,7 @@ from service.notify.delivery import Notifier
 from service.settings import is_loopback
 from service.store import Store, StoreUnavailable
 
+_log = structlog.get_logger("gridsec.http")
 ANSWER_S = 0.7
 """Time limit of the test write, s: `/readyz` answers within 1 s."""
 
@@ -45,14 +47,15 @@ class Probe:
         await asyncio.wait({self._running}, timeout=ANSWER_S)
         if self._running.done():
             return self._running.result()
-        return f"{self._store.name}: no answer within {ANSWER_S:g} s"
+        return f"the database gives no answer within {ANSWER_S:g} s"
 
     async def _check(self) -> str | None:
         # In a separate thread: reads that wait for the database may occupy all shared ones.
         try:
             await to_thread.run_sync(self._access, limiter=CapacityLimiter(1), abandon_on_cancel=True)
         except StoreUnavailable as error:
-            return str(error)
+            _log.warning("the test write failed", problem=str(error))
+            return error.public
         return None
 
     def _access(self) -> None:
@@ -92,7 +95,7 @@ async def readyz(request: Request, backend: BackendHere) -> Any:
     ready, reasons = backend.ready()
     trouble = await request.app.state.probe.trouble()
     if trouble is not None:
-        ready, reasons = False, [*reasons, *([] if any(trouble in one for one in reasons) else [trouble])]
+        ready, reasons = False, list(dict.fromkeys([*reasons, trouble]))
     return _probe(request, ready, reasons, "the service cannot monitor at present")
 
 

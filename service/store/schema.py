@@ -41,6 +41,11 @@ class StoreUnavailable(GridsecError):
 
     code = "database-unavailable"
 
+    @property
+    def public(self) -> str:
+        """Sentence for clients, without address and message of the database."""
+        return f"the database cannot be used ({self.code}); the log of the service has the details"
+
 
 class OutcomeUnknown(StoreUnavailable):
     """The connection broke during the commit of a transaction: it is stored as a whole, or not at all."""
