@@ -129,18 +129,18 @@ def list_alarms(  # one argument per query parameter
 ) -> Any:
     """A page of alarms; `since` and `until` refer to `t_raised`."""
     _within(caller, feeder)
-    last_event, last_change = backend.store.last_event, backend.store.last_incident_event
+    store = backend.store
+    last_event, changes = store.last_event, f"{store.last_incident_event}-{store.suppression_changes}"
     # Before the page is read: changes stored in between are in the page.
     unstored, trouble = backend.unstored()
     # Event numbers identify changes within one database, and a run has only one.
     scope = _scope(caller)
     waits = hashlib.sha256(f"{unstored} {trouble} {scope}".encode()).hexdigest()[:16]
     form = "" if media == tables.JSON else f"-{tables.MEDIA.index(media)}"
-    if known := unchanged(
-        response, f'W/"{request.app.state.run}-{last_event}-{last_change}-{waits}{form}"', if_none_match
-    ):
+    tag = f'W/"{request.app.state.run}-{last_event}-{changes}-{waits}{form}"'
+    if known := unchanged(response, tag, if_none_match):
         return known
-    page, following = backend.store.alarms(
+    page, following = store.alarms(
         state=state or (),
         kind=kind or (),
         severity=severity or (),
@@ -166,7 +166,7 @@ def list_alarms(  # one argument per query parameter
         alarms=listed,
         next=following,
         last_event=last_event,
-        raised=backend.store.raised(among=scope),
+        raised=store.raised(among=scope),
         unstored=unstored,
         problem=trouble,
     )

@@ -378,6 +378,7 @@ class Store(Reader):
             raise
         self._last_event = int(newest or 0)
         self._last_incident_event = int(newest_incident or 0)
+        self._suppression_changes = 0
         if (beat_s := self._connections.beat_s) is not None:
             threading.Thread(
                 target=self._beat, args=(beat_s,), name="gridsec-store-beat", daemon=True
@@ -432,6 +433,11 @@ class Store(Reader):
     def last_incident_event(self) -> int:
         """Number of the newest event of an incident; without a call to the database."""
         return self._last_incident_event
+
+    @property
+    def suppression_changes(self) -> int:
+        """Number of commits of this store that may have changed shelves or planned works."""
+        return self._suppression_changes
 
     def due(self, now: float) -> bool:
         """True if a shelf or a planned work changes by `now`, Unix s; without a call to the database."""
@@ -497,6 +503,7 @@ class Store(Reader):
             if not (grouped or worthy or rejected or kept or happened or without or put):
                 return ()
             newest, following = self._last_incident_event, self._due
+            suppressions = self._suppression_changes + bool(actions or self.due(now))
             with self._connections.write() as connection:
                 if key is not None and _stored_before(connection, key):
                     newer = sa.select(EVENT.c.seq).where(EVENT.c.seq > self._last_event)
@@ -522,7 +529,7 @@ class Store(Reader):
                     newest = connection.scalar(sa.select(sa.func.max(INCIDENT_EVENT.c.seq))) or 0
                     following = incidents.next_due(connection)
             self._marks, self._rolled, self._due = marks, rolled, following
-            self._last_incident_event = newest
+            self._last_incident_event, self._suppression_changes = newest, suppressions
             self._last_event = max((self._last_event, *numbers))
             return numbers
 
