@@ -445,10 +445,14 @@ def _meter_name(site: Site, k: int) -> str:
     return device_name(site.meter_ids[k], site.feeder.customers[int(site.meters[k])])
 
 
+def listed(names: Sequence[str]) -> str:
+    """Return the first `_SHOWN` names, and the number of the others."""
+    rest = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + rest
+
+
 def _listed(site: Site, which: Sequence[int]) -> str:
-    """Names of meters, at most `_SHOWN`."""
-    rest = f" and {len(which) - _SHOWN} more" if len(which) > _SHOWN else ""
-    return ", ".join(_meter_name(site, k) for k in which[:_SHOWN]) + rest
+    return listed([_meter_name(site, k) for k in which])
 
 
 def _who(site: Site, meters: Bools, inverters: Bools, powers: Bools | None = None, *, busbar: Bools) -> str:
@@ -458,9 +462,8 @@ def _who(site: Site, meters: Bools, inverters: Bools, powers: Bools | None = Non
     doubted = () if powers is None else np.flatnonzero(powers)
     for what, customers in (("inverter", site.droop.customer[inverters]), ("reported power", doubted)):
         names = [site.feeder.customers[int(c)] for c in customers]
-        rest = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
         if names:
-            parts.append(f"the {what}{'s' if len(names) > 1 else ''} of {', '.join(names[:_SHOWN])}{rest}")
+            parts.append(f"the {what}{'s' if len(names) > 1 else ''} of {listed(names)}")
     if busbar.any():
         parts.append(busbar_in_words(site, busbar))
     return " and ".join(parts) or "no device"

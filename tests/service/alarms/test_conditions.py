@@ -215,8 +215,19 @@ def test_stalled_meters_are_one_condition_of_the_feeder() -> None:
     assert found.severity is Severity.MINOR
     assert found.evidence == AlarmEvidence(learning=STALLED)
     assert found.reason == (
-        "2 of 3 meters are not learned after twice the expected time of 86401 s: no-busbar (1), silent (1)"
+        "2 of 3 meters are not learned after twice the expected time of 86401 s: m2, m3; "
+        "lost time: no-busbar (1), silent (1)"
     )
+
+
+def test_at_most_five_stalled_meters_have_their_names() -> None:
+    names = [f"m{k}" for k in range(8)]
+    now = report(*(meter(name, customer=f"Load {name}") for name in names))
+    stalled = tuple(StalledMeter(name, SILENT, 30.0) for name in names[:7])
+    learning = LearningReport(("stalled",) * 8, (SILENT,) * 8, 61.0, stalled)
+    (found,) = conditions(with_learning(now, learning))
+    assert ": m0 · Load m0, m1 · Load m1, " in found.reason
+    assert ", m4 · Load m4 and 2 more; " in found.reason
 
 
 def test_a_stalled_meter_without_lost_time_has_words_for_it() -> None:
