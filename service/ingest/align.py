@@ -290,7 +290,7 @@ class Tick:
     clock_offset: tuple[float | None, ...] = ()
     busbar_offset: float | None = None  # lead of the busbar meter's clock, s; None if not measurable
     v_phases: tuple[float, ...] | None = None  # voltages of the busbar's phases, V, as in `Reading`
-    # Sources whose clock offset is measured, None for the busbar meter; None if no offset is to be measured.
+    # Sources with a measured clock offset, None for the busbar meter; None where the clock measures none.
     clocks_known: frozenset[str | None] | None = None
 
     @property
