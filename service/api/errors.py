@@ -19,10 +19,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from feeders.registry import EstimatorUnusable
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
 from service.access.identity import IssuerUnavailable, NotAuthenticated, NotPermitted, TooManyFailures
-from service.alarms.incidents import IncidentChanged, IncidentUnknown, ShelfUnknown, WorkUnknown, WrongTime
-from service.alarms.state_machine import AlarmUnknown, AlreadyAcknowledged, NotAcknowledged, RaisedAgain
+from service.alarms.incidents import IncidentChanged, WrongTime
+from service.alarms.state_machine import AlreadyAcknowledged, NotAcknowledged, RaisedAgain
 from service.engine.commissioning import NothingToLearn
-from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, TooManyFeeders
+from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, IdUnknown, TooManyFeeders
 from service.store import OutcomeUnknown, StoreUnavailable
 
 _log = structlog.get_logger("gridsec.http")
@@ -204,10 +204,7 @@ _STATUS: dict[type[GridsecError], int] = {
     NotObservable: 422,
     DesignInfeasible: 422,
     EstimatorUnusable: 422,
-    AlarmUnknown: 404,
-    IncidentUnknown: 404,
-    ShelfUnknown: 404,
-    WorkUnknown: 404,
+    IdUnknown: 404,
     WrongTime: 422,
     FeederUnknown: 404,
     AlreadyAcknowledged: 409,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import Annotated, Any
 
@@ -20,6 +21,7 @@ from service.api.errors import problem
 from service.notify.delivery import Notifier
 from service.settings import is_loopback
 from service.store import Store, StoreUnavailable
+from service.store.deliveries import DeliveryStore
 
 _log = structlog.get_logger("gridsec.http")
 ANSWER_S = 0.7
@@ -141,21 +143,22 @@ def list_dead_letters(
 @_notifications.post("/dead-letters/resend", dependencies=[Depends(json_only)])
 def resend_dead_letters(request: Request, choice: models.LetterChoice) -> models.LetterCount:
     """Send dead letters again, with the same message ids; a delivered one is deleted."""
-    notifier: Notifier | None = request.app.state.notifier
-    if notifier is None:
-        return models.LetterCount(count=0)
-    count = notifier.store.resend(target=choice.target, ids=choice.ids)
-    notifier.look()
-    return models.LetterCount(count=count)
+    return _change_letters(request, DeliveryStore.resend, choice)
 
 
 @_notifications.post("/dead-letters/discard", dependencies=[Depends(json_only)])
 def discard_dead_letters(request: Request, choice: models.LetterChoice) -> models.LetterCount:
     """Delete dead letters."""
+    return _change_letters(request, DeliveryStore.discard, choice)
+
+
+def _change_letters(
+    request: Request, change: Callable[..., int], choice: models.LetterChoice
+) -> models.LetterCount:
     notifier: Notifier | None = request.app.state.notifier
     if notifier is None:
         return models.LetterCount(count=0)
-    count = notifier.store.discard(target=choice.target, ids=choice.ids)
+    count = change(notifier.store, target=choice.target, ids=choice.ids)
     notifier.look()
     return models.LetterCount(count=count)
 

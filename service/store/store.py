@@ -25,7 +25,7 @@ from service.alarms.state_machine import Alarm, AlarmState, AlarmTransition, Cha
 from service.report.report import FeederReport
 from service.store import incidents
 from service.store.connect import Connections
-from service.store.incidents import IncidentReader, rank_of, sorted_by, words_in
+from service.store.incidents import IncidentReader
 from service.store.rollups import AlarmSpan, add_rollups, prune_rollups, read_alarm_spans, read_series
 from service.store.schema import (
     ALARM,
@@ -109,29 +109,16 @@ class Reader(IncidentReader):
         Returns alarms, cursor: the cursor is None on the last page.
         """
         a = ALARM.c
-        query = sa.select(a.id, a.data).where(*words_in(a.words, text))
-        for column, allowed in ((a.state, state), (a.kind, kind), (a.severity, severity)):
-            if allowed:
-                query = query.where(column.in_([str(value) for value in allowed]))
-        for column, wanted in ((a.feeder, feeder), (a.meter, meter), (a.incident, incident)):
-            if wanted is not None:
-                query = query.where(column == wanted)
-        if among is not None:
-            query = query.where(a.feeder.in_(among))
-        if since is not None:
-            query = query.where(a.t_raised >= since)
-        if until is not None:
-            query = query.where(a.t_raised < until)
+        given = {"state": state, "kind": kind, "severity": severity, "feeder": feeder}
+        given |= {"meter": meter, "incident": incident}
+        wanted = incidents.filters(a, among, text, (since, until), (a.t_raised, a.t_raised), **given)
         if shelved is not None:
             any_shelf = sa.or_(sa.false(), *(_shelved_by(shelf) for shelf in self.shelves(standing=True)))
             now = sa.and_(a.state != str(AlarmState.CLEARED), any_shelf)
-            query = query.where(now if shelved else sa.not_(now))
-        keys = {"onset": None, "severity": rank_of(a.severity), "raised": a.t_raised}
-        query, key = sorted_by(query, a.id, keys[sort], cursor)
-        with self._read() as connection:
-            rows = connection.execute(query.limit(limit + 1)).all()
-        page = [from_json(json.loads(row.data)) for row in rows[:limit]]
-        return page, (key(rows[limit - 1]) if len(rows) > limit else None)
+            wanted.append(now if shelved else sa.not_(now))
+        keys = {"onset": None, "severity": incidents.rank_of(a.severity), "raised": a.t_raised}
+        rows, following = incidents.page(self._read, a, wanted, keys[sort], cursor, limit)
+        return [from_json(data) for data in rows], following
 
     def raised(self, *, among: Collection[str] | None = None) -> int:
         """Number of active alarms without an acknowledgement, of some feeders or (None) of all."""
@@ -167,7 +154,7 @@ class Reader(IncidentReader):
         with self._read() as connection:
             return [from_json(json.loads(data)) for data in connection.scalars(query)]
 
-    def events(self, alarm_id: str, *, after: int = 0, limit: int = 1000) -> list[AlarmEvent]:
+    def events(self, alarm_id: str, after: int = 0, *, limit: int = 1000) -> list[AlarmEvent]:
         """Return the events of an alarm, oldest first. `after` restricts to events with a higher number."""
         query = sa.select(EVENT).where(EVENT.c.alarm_id == alarm_id, EVENT.c.seq > after)
         query = query.order_by(EVENT.c.seq).limit(limit)
