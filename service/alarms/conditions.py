@@ -11,9 +11,9 @@ from typing import Annotated
 from pydantic import ConfigDict, Field, JsonValue, with_config
 
 from gridsec.interface import Cause, Decision
+from service.report.data_errors import DataErrorReport
 from service.report.report import (
     BUSBAR,
-    DataErrorReport,
     ExplanationReport,
     FeederReport,
     MeterState,

@@ -45,8 +45,9 @@ from service.engine.load import FeederLoad, LoadControl
 from service.engine.operators import SHELVE_MOST_S, Operators
 from service.errors import FeederUnknown
 from service.ingest.align import Clock
+from service.ingest.decode import Wire
 from service.ingest.queues import Inbox, Sample
-from service.ingest.reading import BadReading, BadReason, Reading, Readings, Wire, head_of
+from service.ingest.reading import BadReading, BadReason, Reading, Readings, head_of
 from service.metrics import Metrics
 from service.report.report import BUSBAR, FeederReport
 from service.report.tick_state import TickState

@@ -30,7 +30,8 @@ from service.engine.commissioning import FeederCommissioning
 from service.ingest.align import Aligner, AlignRules, Clock, Placed, ReadingOutcome, Tick, rules
 from service.ingest.reading import Known, Reading, Readings
 from service.report import feeder_info
-from service.report.report import BUSBAR, DataErrors, FeederReport, busbar_phases, snapshot
+from service.report.data_errors import DataErrors
+from service.report.report import BUSBAR, FeederReport, busbar_phases, snapshot
 from service.report.tick_state import TickState
 from service.store.state_codec import KeptInvalid, StateSnapshot, decode_distrust, encode_distrust
 

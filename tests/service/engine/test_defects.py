@@ -17,8 +17,8 @@ from service.engine.engine import BAD_PER_ROUND, BAD_PER_SOURCE, Engine, Runtime
 from service.engine.feeder_monitor import Phase, design
 from service.engine.runtime import Runtime
 from service.ingest.align import Clock
+from service.ingest.decode import DecodedPayload, Wire
 from service.ingest.queues import Sample
-from service.ingest.reading import DecodedPayload, Wire
 from service.report.report import FeederReport
 from service.store import Store
 from tests.service.liars import FEEDER, START, rounds, until
