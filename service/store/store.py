@@ -39,6 +39,7 @@ from service.store.schema import (
     INCIDENT_EVENT,
     LAYOUT,
     OUTBOX,
+    SIGNED,
     WRITER,
     AlarmEvent,
     CommissioningChange,
@@ -266,6 +267,10 @@ class Reader(IncidentReader):
         """Return the stored suspicions of a feeder, or None."""
         return self._kept(DISTRUST, feeder, SnapshotKind.DISTRUST)
 
+    def signed(self, feeder: str) -> StateSnapshot | None:
+        """Return the stored order of a feeder's signed readings, or None."""
+        return self._kept(SIGNED, feeder, SnapshotKind.SIGNED)
+
     def _kept(self, table: sa.Table, feeder: str, matter: SnapshotKind) -> StateSnapshot | None:
         c = table.c
         with self._read() as connection:
@@ -326,7 +331,11 @@ ALONE_S = 5.0
 _STEADY_S = 86_400.0
 """Time for which a feeder must have reported before anything is deleted, s."""
 _log = structlog.get_logger("gridsec.store")
-_KEPT = {SnapshotKind.COMMISSION: COMMISSION, SnapshotKind.DISTRUST: DISTRUST}
+_KEPT = {
+    SnapshotKind.COMMISSION: COMMISSION,
+    SnapshotKind.DISTRUST: DISTRUST,
+    SnapshotKind.SIGNED: SIGNED,
+}
 
 
 class Store(Reader):
@@ -468,7 +477,8 @@ class Store(Reader):
         reports: reports of the feeders; the history selects from them.
         rejected: rejected readings; the newest `BAD_READINGS_KEPT` are kept. Readings that the database
             cannot represent are dropped and logged.
-        kept, happened: state of the feeders' commissioning and suspicions, and changes of the former.
+        kept, happened: state of the feeders' commissioning, suspicions and signed readings, and changes of the
+            first.
         without: delete the tables of this feeder, its commissioning and its suspicions.
         put: a feeder and the columns of its files as JSON, which replace the stored ones.
         actions: actions of operators on incidents, shelves and planned works.
@@ -638,7 +648,8 @@ def _stored_before(connection: sa.Connection, key: int) -> bool:
 
 def _forget_feeder(connection: sa.Connection, name: str) -> None:
     connection.execute(FEEDER.delete().where(FEEDER.c.name == name))
-    for table in _KEPT.values():
+    # The order of signed readings stays: a feeder that is put again must not accept a repetition.
+    for table in (COMMISSION, DISTRUST):
         connection.execute(table.delete().where(table.c.feeder == name))
 
 

@@ -367,9 +367,8 @@ def test_the_second_operator_is_told_who_was_first() -> None:
 
 def test_an_unknown_alarm_cannot_be_acknowledged() -> None:
     book, alarm = raised()
-    with refused(AlarmUnknown, "unknown-alarm") as caught:
+    with refused(AlarmUnknown, "unknown-alarm"):
         acknowledge(book, "nothing", "Ada", "", T0)
-    assert caught.value.alarm_id == "nothing"
     pending, _ = run(at_1_hz("P"))
     with pytest.raises(AlarmUnknown):
         acknowledge(pending, alarm.id, "Ada", "", T0)
