@@ -477,8 +477,8 @@ class Store(Reader):
         reports: reports of the feeders; the history selects from them.
         rejected: rejected readings; the newest `BAD_READINGS_KEPT` are kept. Readings that the database
             cannot represent are dropped and logged.
-        kept, happened: state of the feeders' commissioning, suspicions and signed readings, and changes of the
-            first.
+        kept, happened: state of the feeders' commissioning, suspicions and signed readings, and changes of
+            the first.
         without: delete the tables of this feeder, its commissioning and its suspicions.
         put: a feeder and the columns of its files as JSON, which replace the stored ones.
         actions: actions of operators on incidents, shelves and planned works.
