@@ -198,6 +198,19 @@ def test_undecided_for_want_of_readings_is_told_unless_data_loss_tells_all_of_it
     assert (undecided.known, undecided.unheard) == (not covered, True)
 
 
+# --------------------------------------------------------------------- clocks
+
+
+def test_clocks_of_meters_and_of_the_busbar_meter() -> None:
+    now = report(meter("m1", clock_offset_s=1.5), meter("m2", clock_offset_s=-2.0), meter("m3"))
+    found = conditions(replace(now, busbar=replace(now.busbar, clock_offset_s=3.0)))
+    assert [(one.subject, one.kind, one.severity) for one in found] == [
+        (name, AlarmKind.CLOCK_OFFSET, Severity.MINOR) for name in ("m1", "m2", BUSBAR)
+    ]
+    assert ["ahead of" in one.reason for one in found] == [True, False, True]
+    assert ["come later" in one.reason for one in found] == [False, True, False]
+
+
 # ------------------------------------------------------------------- learning
 
 SILENT, NO_BUSBAR = LearningReason.SILENT, LearningReason.NO_BUSBAR
