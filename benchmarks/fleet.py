@@ -47,8 +47,8 @@ from service.engine import feeder_monitor
 from service.engine.engine import Engine, RuntimeConfig
 from service.engine.feeder_monitor import design, known_of
 from service.ingest.align import Aligner, rules
+from service.ingest.decode import Wire
 from service.ingest.queues import BusConfig, BusCounts, Sample, Value
-from service.ingest.reading import Wire
 from service.ingest.zenoh_bus import Bus, MeterClient, session
 from service.report.tick_state import TickState
 from service.store import Store

@@ -13,6 +13,16 @@ def prefixed(start: str, problem: str) -> Problem:
     return Problem(getattr(problem, "code", ""), start + problem.removeprefix(start))
 
 
+class IdUnknown(GridsecError):
+    """No object of a kind has this id."""
+
+    code = "unknown-id"
+    kind = "object"
+
+    def __init__(self, number: str) -> None:
+        super().__init__(f"no {self.kind} has the id {number!r}")
+
+
 class FeederUnknown(GridsecError):
     """No feeder has this name."""
 

@@ -30,7 +30,7 @@ SYSTEM_PARTS = {"alertmanager", "browser", "postgresql"}
 
 TESTS = Path(__file__).parent
 MEASURED = (
-    *("gridsec/*", "contracts/*", "service/alarms/test_state_machine.py", "service/alarms/test_incidents.py"),
+    *("gridsec/*", "contracts/*", "service/alarms/*"),
     *("feeders/studies/calibrate/*", "feeders/studies/droop/*"),
 )
 """Files of tests that coverage traces, except the tests that are marked `no_cover`."""

@@ -2,7 +2,7 @@
 
 The attachment of a sample is `v1 SCHEME EPOCH:SEQ SIGNATURE` with the scheme `ed25519` or `hmac` (HMAC with
 SHA-256) and the signature in base64. The signature is over `v1 SCHEME EPOCH:SEQ KEY`, a line feed, and the
-payload. The pair (epoch, seq) of a meter increases from reading to reading.
+payload. The pair (epoch, seq) of a meter increases from reading to reading, also over a restart.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import csv
 import hashlib
 import hmac
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -28,6 +28,9 @@ from service.errors import prefixed
 BUSBAR = "substation"
 ATTACHMENT_MAX = 256
 """Size of the longest attachment that is read, bytes."""
+
+DIGEST_BYTES = 8
+"""Size of the digest of a key, bytes: two keys of one meter are equal in it with probability 2^-64."""
 
 SECRET_MIN = 16
 """Size of the shortest secret, bytes."""
@@ -51,11 +54,21 @@ class Refusal(NamedTuple):
     problem: str
 
 
+class SignedOrder(NamedTuple):
+    """The newest accepted reading of a meter with a key of its own."""
+
+    meter: str
+    key: str  # digest of the key: another key begins anew
+    epoch: int
+    seq: int
+
+
 @dataclass(frozen=True, slots=True)
 class _Entry:
     scheme: Scheme
     verifies: Callable[[bytes, bytes], bool]
     certificate: str = ""
+    digest: str = ""
 
 
 @dataclass(slots=True)
@@ -66,11 +79,30 @@ class MeterKeys:
     ----------
     accepts_unlisted
         Accept readings of meters without a key.
+    changed
+        Feeders with accepted signed readings that are not stored.
     """
 
     entries: Mapping[tuple[str, str], _Entry]
     accepts_unlisted: bool = False
+    changed: set[str] = field(default_factory=set)
     _newest: dict[tuple[str, str], tuple[int, int]] = field(default_factory=dict)
+
+    def orders(self, feeder: str) -> list[SignedOrder]:
+        """Return the newest accepted readings of a feeder's meters."""
+        return [
+            SignedOrder(meter, self.entries[name, meter].digest, *newest)
+            for (name, meter), newest in self._newest.items()
+            if name == feeder
+        ]
+
+    def restore(self, feeder: str, orders: Iterable[SignedOrder]) -> None:
+        """Take over the newest readings of an earlier process, of meters that have the same key."""
+        for meter, digest, *order in orders:
+            place = feeder, meter
+            entry = self.entries.get(place)
+            if entry is not None and entry.digest == digest:
+                self._newest[place] = max(self._newest.get(place, (-1, -1)), (order[0], order[1]))
 
     def check(
         self, feeder: str, meter: str | None, key: str, payload: bytes, attachment: bytes
@@ -102,6 +134,7 @@ class MeterKeys:
             text = f"epoch:seq is {order[0]}:{order[1]}, not after {newest[0]}:{newest[1]}"
             return Refusal("replayed", text)
         self._newest[place] = order
+        self.changed.add(feeder)
         return None
 
 
@@ -189,12 +222,18 @@ def _entry(scheme: str, key: str) -> _Entry:
         if len(raw) < SECRET_MIN:
             text = f"the secret has {len(raw)} bytes; expected at least {SECRET_MIN}"
             raise InputInvalid([Problem("wrong-key", text)])
-        return _Entry(Scheme.HMAC, _hmac_of(raw))
+        return _Entry(Scheme.HMAC, _hmac_of(raw), digest=_digest(raw))
     try:
-        return _Entry(Scheme.ED25519, _ed25519_of(Ed25519PublicKey.from_public_bytes(raw)))
+        public = Ed25519PublicKey.from_public_bytes(raw)
+        return _Entry(Scheme.ED25519, _ed25519_of(public), digest=_digest(raw))
     except ValueError as error:
         text = f"the public key has {len(raw)} bytes; expected 32"
         raise InputInvalid([Problem("wrong-key", text)]) from error
+
+
+def _digest(key: bytes) -> str:
+    """Digest that tells keys apart, and from which no key can be computed."""
+    return hmac.digest(key, b"gridsec signed order", hashlib.sha256)[:DIGEST_BYTES].hex()
 
 
 def _never(_signature: bytes, _content: bytes) -> bool:

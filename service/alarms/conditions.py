@@ -11,14 +11,16 @@ from typing import Annotated
 from pydantic import ConfigDict, Field, JsonValue, with_config
 
 from gridsec.interface import Cause, Decision
+from service.report.data_errors import DataErrorReport
 from service.report.report import (
     BUSBAR,
-    DataErrorReport,
     ExplanationReport,
     FeederReport,
     MeterState,
     StalledMeter,
+    device_name,
     finite,
+    listed,
 )
 
 
@@ -390,6 +392,8 @@ def _learning(report: FeederReport) -> Iterable[Condition]:
     stalled = () if learning is None else learning.stalled
     count = Counter(meter.reason or "no time lost" for meter in stalled)
     why = ", ".join(f"{reason} ({number})" for reason, number in sorted(count.items()))
+    owners = {meter.meter: meter.customer or "" for meter in report.meters}
+    names = listed([device_name(one.meter, owners.get(one.meter, "")) for one in stalled])
     time = "" if learning is None or learning.expected_s is None else f" of {learning.expected_s:.0f} s"
     yield Condition(
         AlarmKind.LEARNING_STALLED,
@@ -398,6 +402,6 @@ def _learning(report: FeederReport) -> Iterable[Condition]:
         Severity.MINOR,
         AlarmEvidence(learning=stalled),
         f"{len(stalled)} of {len(report.meters)} meters are not learned after twice the expected time{time}: "
-        f"{why}",
+        f"{names}; lost time: {why}",
         known=learning is not None,
     )

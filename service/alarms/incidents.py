@@ -26,6 +26,7 @@ from pydantic import Field, TypeAdapter
 from gridsec.errors import GridsecError
 from service.alarms.conditions import AlarmKind, Severity
 from service.alarms.state_machine import AlarmState, AlarmTransition, Change, ulid
+from service.errors import IdUnknown
 
 T = TypeVar("T")
 
@@ -190,13 +191,11 @@ def event_json(event: IncidentEvent) -> dict[str, Any]:
 # --- Shelves and planned work ---
 
 
-class IncidentUnknown(GridsecError):
+class IncidentUnknown(IdUnknown):
     """No incident has this id."""
 
     code = "unknown-incident"
-
-    def __init__(self, incident_id: str) -> None:
-        super().__init__(f"no incident has the id {incident_id!r}")
+    kind = "incident"
 
 
 class IncidentChanged(GridsecError):
@@ -212,22 +211,18 @@ class IncidentChanged(GridsecError):
         )
 
 
-class ShelfUnknown(GridsecError):
+class ShelfUnknown(IdUnknown):
     """No shelf has this id."""
 
     code = "unknown-shelf"
-
-    def __init__(self, shelf_id: str) -> None:
-        super().__init__(f"no shelf has the id {shelf_id!r}")
+    kind = "shelf"
 
 
-class WorkUnknown(GridsecError):
+class WorkUnknown(IdUnknown):
     """No planned work has this id."""
 
     code = "unknown-planned-work"
-
-    def __init__(self, work_id: str) -> None:
-        super().__init__(f"no planned work has the id {work_id!r}")
+    kind = "planned work"
 
 
 class WrongTime(GridsecError):

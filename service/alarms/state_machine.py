@@ -28,6 +28,7 @@ from pydantic import Field, TypeAdapter
 
 from gridsec.errors import GridsecError, InputInvalid, Problem
 from service.alarms.conditions import AlarmEvidence, AlarmKind, Condition, Severity, conditions
+from service.errors import IdUnknown
 
 INCIDENT_S = 60.0
 """Largest distance in time of alarms of one incident, s; two ticks if these are longer."""
@@ -52,14 +53,11 @@ class Change(StrEnum):
     COMMENTED = "commented"
 
 
-class AlarmUnknown(GridsecError):
+class AlarmUnknown(IdUnknown):
     """No alarm has this id."""
 
     code = "unknown-alarm"
-
-    def __init__(self, alarm_id: str) -> None:
-        self.alarm_id = alarm_id
-        super().__init__(f"no alarm has the id {alarm_id!r}")
+    kind = "alarm"
 
 
 class AlreadyAcknowledged(GridsecError):

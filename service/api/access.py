@@ -8,6 +8,8 @@ Records of keys are cached for `FRESH_S`: a revoked key ends within this time, a
 database does not answer. A client with more than
 `FAILURES` invalid credentials per minute gets 429 for further invalid ones; valid credentials always pass,
 so that a client behind the same address cannot lock out others.
+
+Refusals get a limited number of entries in the audit log. The numbers of the others are entries of their own.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from ipaddress import IPv6Address, IPv6Network, ip_address
 from typing import Any, Final
 
 from limits import RateLimitItemPerMinute
@@ -54,9 +58,63 @@ FAILURES: Final = 10
 """Number of invalid credentials of one client per minute that get 401."""
 LOGGED: Final = 60
 """Number of invalid credentials per minute that get an entry in the audit log."""
+REFUSALS: Final = 10
+"""Number of refused changes of one identity per minute that get an entry in the audit log."""
+COUNTED_S: Final = 60.0
+"""Time for which refusals without an entry are counted, s; their number is then an entry."""
+IPV6_SUBNET: Final = 64
+"""Length of the prefix of a subnet, bits (RFC 4291): one client can use all of its addresses."""
 COOKIE_BYTES: Final = 32
 DETAIL_BYTES: Final = 2000
 """Part of a request's body in the audit log, bytes."""
+
+
+class _Refusals:
+    """Audit entries of refusals at a limited rate; numbers of those without an entry. Thread-safe."""
+
+    def __init__(self, store: AccessStore, wall: Callable[[], float]) -> None:
+        self._store, self._wall = store, wall
+        self._limiter = MovingWindowRateLimiter(MemoryStorage())
+        self._lock = threading.Lock()
+        # Begin of the count (Unix s) and number, by identity and credential.
+        self._counts: dict[tuple[str, str], tuple[float, int]] = {}
+
+    def append(self, limit: int, who: tuple[str, str], action: str, target: str, detail: str) -> None:
+        """Append the entry of a refusal, or count it beyond `limit` entries per minute.
+
+        who: identity and credential, which have a limit together.
+        """
+        if not self._limiter.hit(RateLimitItemPerMinute(limit), *who):
+            self.count(who)
+            return
+        self.flush()
+        self._store.append(self._wall(), *who, action, target, detail)
+
+    def count(self, who: tuple[str, str]) -> None:
+        """Count a refusal without an entry of its own."""
+        with self._lock:
+            begin, count = self._counts.get(who, (self._wall(), 0))
+            self._counts[who] = begin, count + 1
+        self.flush()
+
+    def flush(self, *, over_only: bool = True) -> None:
+        """Append the numbers of refusals without an entry; with `over_only` those of ended counts."""
+        now = self._wall()
+        with self._lock:
+            ended = [
+                who for who, (begin, _) in self._counts.items() if not over_only or now - begin >= COUNTED_S
+            ]
+            counts = {who: self._counts.pop(who) for who in ended}
+        while counts:
+            who, (begin, count) = counts.popitem()
+            detail = f"{count} refusals in {now - begin:.0f} s have no entry of their own"
+            try:
+                self._store.append(now, *who, "refused: further", "", detail)
+            except StoreUnavailable:
+                with self._lock:
+                    for each, (start, number) in {**counts, who: (begin, count)}.items():
+                        self._counts[each] = start, number + self._counts.get(each, (0.0, 0))[1]
+                raise
 
 
 class Authenticator:
@@ -73,7 +131,8 @@ class Authenticator:
         self.store, self.tokens, self.wall = store, tokens, wall
         self._required = False
         self._failures = MovingWindowRateLimiter(MemoryStorage())
-        self._limit, self._total = RateLimitItemPerMinute(FAILURES), RateLimitItemPerMinute(LOGGED)
+        self._limit = RateLimitItemPerMinute(FAILURES)
+        self._refusals = _Refusals(store, wall)
         self._lock = threading.Lock()
         self._cache: dict[str, tuple[float, Any]] = {}
         self._running: dict[str, Future[Any]] = {}
@@ -116,11 +175,12 @@ class Authenticator:
                 return self._key(text).identity
             return self.tokens.identify(text)
         except NotAuthenticated as error:
-            if not self._failures.hit(self._limit, client):
+            # All clients share an identity in the log: addresses can be changed at will.
+            unknown = "", ""
+            if not self._failures.hit(self._limit, subnet_of(client)):
+                self._refusals.count(unknown)
                 raise TooManyFailures("too many invalid credentials; wait a minute") from error
-            # All clients together: addresses can be changed at will.
-            if self._failures.hit(self._total, "all"):
-                self.store.append(self.wall(), "", "", "invalid credential", client, str(error))
+            self._refusals.append(LOGGED, unknown, "invalid credential", client, str(error))
             raise
 
     def log_in(self, text: str, client: str) -> tuple[Identity, str, float]:
@@ -135,8 +195,18 @@ class Authenticator:
             raise NotAuthenticated("a session needs an API key")
         cookie = secrets.token_urlsafe(COOKIE_BYTES)
         expires = self.store.open_session(cookie, parsed[0], self.wall())
-        self.store.append(self.wall(), identity.name, identity.credential, "log in", client)
+        self.record(identity, "log in", client)
         return identity, cookie, expires
+
+    def record(self, identity: Identity, action: str, target: str, detail: str = "") -> None:
+        """Append an entry of the audit log; durable when this returns."""
+        self._refusals.flush()
+        self.store.append(self.wall(), identity.name, identity.credential, action, target, detail)
+
+    def record_refusal(self, identity: Identity, action: str, target: str, detail: str) -> None:
+        """Append an entry of a refused change, at most `REFUSALS` per minute and identity."""
+        who = identity.name, identity.credential
+        self._refusals.append(REFUSALS, who, f"refused: {action}", target, detail)
 
     def log_out(self, cookie: str) -> None:
         """End a session."""
@@ -186,8 +256,10 @@ class Authenticator:
         return value
 
     def close(self) -> None:
-        """End the threads of reads."""
+        """End the threads of reads, and append the numbers of refusals without an entry."""
         self._readers.shutdown(wait=False, cancel_futures=True)
+        with suppress(StoreUnavailable):
+            self._refusals.flush(over_only=False)
 
 
 _COOKIE = re.compile(r"[A-Za-z0-9_-]{43}")
@@ -208,6 +280,19 @@ def client_of(request: Request) -> str:
     return request.client.host if request.client is not None else "unknown"
 
 
+def subnet_of(client: str) -> str:
+    """Subnet of an IPv6 address; any other address as it is. An IPv4-mapped address is the IPv4 address."""
+    try:
+        address = ip_address(client.partition("%")[0])
+    except ValueError:
+        return client
+    if not isinstance(address, IPv6Address):
+        return str(address)
+    if address.ipv4_mapped is not None:
+        return str(address.ipv4_mapped)
+    return str(IPv6Network((int(address), IPV6_SUBNET), strict=False))
+
+
 def authorise(authenticator: Authenticator, request: Request, route: str, body: bytes) -> Identity:
     """Identity of a request that may use a restricted route; the audit log has changes before they are made.
 
@@ -225,11 +310,8 @@ def authorise(authenticator: Authenticator, request: Request, route: str, body: 
     # Without authentication no identity could be held to an entry.
     if identity is not OPEN and request.method not in {"GET", "HEAD"}:
         detail = body[:DETAIL_BYTES].decode("utf-8", "replace")
-        action = route if reason is None else f"refused: {route}"
-        target = request.url.path
-        authenticator.store.append(
-            authenticator.wall(), identity.name, identity.credential, action, target, detail
-        )
+        record = authenticator.record if reason is None else authenticator.record_refusal
+        record(identity, route, request.url.path, detail)
     if reason is not None:
         raise NotPermitted(reason)
     return identity

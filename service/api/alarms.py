@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterable
+from contextlib import aclosing
 from functools import partial
-from typing import Annotated, Any, Literal
+from operator import attrgetter
+from typing import Annotated, Any, Literal, TypeVar
 
 from anyio import to_thread
 from fastapi import APIRouter, Depends, Header, HTTPException, Path, Query, Request, Response
@@ -52,12 +54,16 @@ from service.api.dependencies import (
     wakes,
 )
 from service.engine.operators import ShelfRequest
-from service.errors import FeederUnknown
+from service.errors import FeederUnknown, IdUnknown
 from service.store import AlarmEvent, StoreUnavailable
 
 SHIFT_S = 8 * 3600.0
 """Length of a shift, s: time of the comments of a hand-over."""
-_EVENT, _INCIDENT_EVENT = TypeAdapter(AlarmEvent), TypeAdapter(IncidentEvent)
+_STREAMS: dict[str, tuple[str, str, TypeAdapter[Any]]] = {
+    "alarm": ("last_event", "events_after", TypeAdapter(AlarmEvent)),
+    "incident": ("last_incident_event", "incident_events_after", TypeAdapter(IncidentEvent)),
+}
+"""Number of the newest event and read access of the store, and form of the events, by name of the stream."""
 
 _alarms = APIRouter(prefix="/api/v1/alarms", tags=["alarms"], dependencies=[Depends(known_query)])
 _incidents = APIRouter(prefix="/api/v1/incidents", tags=["incidents"], dependencies=[Depends(known_query)])
@@ -75,6 +81,13 @@ Words = Annotated[
 ]
 Cursor = Annotated[str | None, Query(pattern=r"^([0-9.e+-]{1,32}~)?[0-9A-Z]{26}$")]
 Standing = Annotated[bool, Query(description="Leave out those that have ended.")]
+After = Annotated[int, Query(ge=0, le=MAX_EVENT, description="Only events with a higher number.")]
+Limit = Annotated[int, Query(ge=1, le=1000)]
+StreamFeeder = Annotated[str | None, Query(pattern=NAME, description="Restrict to this feeder.")]
+StreamAfter = Annotated[int | None, Query(ge=0, description="Begin after this event number.")]
+LastEvent = Annotated[int | None, Header(ge=0, description="Takes precedence over `after`.")]
+T = TypeVar("T", Alarm, Incident, Shelf, PlannedWork)
+E = TypeVar("E", AlarmEvent, IncidentEvent)
 
 
 def _within(caller: Identity, feeder: str | None) -> None:
@@ -85,6 +98,57 @@ def _within(caller: Identity, feeder: str | None) -> None:
 
 def _scope(caller: Identity) -> list[str] | None:
     return None if caller.feeders is None else sorted(caller.feeders)
+
+
+def _found(caller: Identity, read: Callable[[str], T | None], error: type[IdUnknown], number: str) -> T:
+    """Object with an id, within the caller's scope."""
+    found = read(number)
+    if found is None or not caller.sees(found.feeder):
+        raise error(number)
+    return found
+
+
+def _alarm(backend: Backend, caller: Identity, number: str) -> Alarm:
+    return _found(caller, backend.store.alarm, AlarmUnknown, number)
+
+
+def _incident(backend: Backend, caller: Identity, number: str) -> Incident:
+    return _found(caller, backend.store.incident, IncidentUnknown, number)
+
+
+def _events(read: Callable[..., list[E]], after: int, limit: int) -> tuple[list[E], int | None]:
+    """A page of events after a number, and the number of its last one if more follow."""
+    found = read(after, limit=limit + 1)
+    page = found[:limit]
+    return page, page[-1].seq if len(found) > limit else None
+
+
+async def _stream(
+    permission: Permission, backend: Backend, name: str, feeder: str | None, start: int | None
+) -> AsyncGenerator[ServerSentEvent]:
+    """Server-sent events `alarm` or `incident` after a number; None: from the next event on."""
+    caller, store = permission.caller, backend.store
+    _within(caller, feeder)
+    counter, reader, form = _STREAMS[name]
+    newest, read = attrgetter(counter), getattr(store, reader)
+    # A number beyond the newest belongs to another database: start now, otherwise no event would ever come.
+    seen = newest(store) if start is None else min(start, newest(store))
+    yield ServerSentEvent(comment="connected", id=str(seen), retry=2000)
+    async for _ in wakes(backend):
+        if not await permission.lasts():
+            return
+        while seen < (last := newest(store)):
+            try:
+                events = await to_thread.run_sync(partial(read, seen, feeder=feeder))
+            except StoreUnavailable:
+                return  # The client reconnects with the number of its last event.
+            for event in events:
+                seen = event.seq
+                if caller.sees(getattr(event, name).feeder):
+                    data = form.dump_json(event).decode()
+                    yield ServerSentEvent(event=name, id=str(event.seq), raw_data=data)
+            if not events:
+                seen = last
 
 
 def _check_filters(backend: Backend, caller: Identity, feeder: str | None, meter: str | None) -> None:
@@ -124,23 +188,23 @@ def list_alarms(  # one argument per query parameter
         Literal["onset", "severity", "raised"], Query(description="Latest, or most severe, first.")
     ] = "onset",
     cursor: Cursor = None,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    limit: Limit = 100,
     if_none_match: IfNoneMatch = None,
 ) -> Any:
     """A page of alarms; `since` and `until` refer to `t_raised`."""
     _within(caller, feeder)
-    last_event, last_change = backend.store.last_event, backend.store.last_incident_event
+    store = backend.store
+    last_event, changes = store.last_event, f"{store.last_incident_event}-{store.suppression_changes}"
     # Before the page is read: changes stored in between are in the page.
     unstored, trouble = backend.unstored()
     # Event numbers identify changes within one database, and a run has only one.
     scope = _scope(caller)
     waits = hashlib.sha256(f"{unstored} {trouble} {scope}".encode()).hexdigest()[:16]
     form = "" if media == tables.JSON else f"-{tables.MEDIA.index(media)}"
-    if known := unchanged(
-        response, f'W/"{request.app.state.run}-{last_event}-{last_change}-{waits}{form}"', if_none_match
-    ):
+    tag = f'W/"{request.app.state.run}-{last_event}-{changes}-{waits}{form}"'
+    if known := unchanged(response, tag, if_none_match):
         return known
-    page, following = backend.store.alarms(
+    page, following = store.alarms(
         state=state or (),
         kind=kind or (),
         severity=severity or (),
@@ -166,7 +230,7 @@ def list_alarms(  # one argument per query parameter
         alarms=listed,
         next=following,
         last_event=last_event,
-        raised=backend.store.raised(among=scope),
+        raised=store.raised(among=scope),
         unstored=unstored,
         problem=trouble,
     )
@@ -179,37 +243,18 @@ async def stream_alarms(  # noqa: PLR0917  # one argument per query parameter
     request: Request,
     backend: BackendHere,
     caller: Caller,
-    feeder: Annotated[str | None, Query(pattern=NAME, description="Restrict to this feeder.")] = None,
-    after: Annotated[int | None, Query(ge=0, description="Begin after this event number.")] = None,
-    last_event_id: Annotated[int | None, Header(ge=0, description="Takes precedence over `after`.")] = None,
+    feeder: StreamFeeder = None,
+    after: StreamAfter = None,
+    last_event_id: LastEvent = None,
 ) -> AsyncIterator[ServerSentEvent]:
     """Server-sent events `alarm`, with event numbers as ids: with `Last-Event-ID` none is missed.
 
     Without it and without `after`, the stream starts with the next event.
     """
-    _within(caller, feeder)
-    store = backend.store
-    start = last_event_id if last_event_id is not None else after
-    # A number beyond the newest belongs to another database: start now, otherwise no event would ever come.
-    seen = store.last_event if start is None else min(start, store.last_event)
-    yield ServerSentEvent(comment="connected", id=str(seen), retry=2000)
-    permission = Permission(request, caller)
-    async for _ in wakes(backend):
-        if not await permission.lasts():
-            return
-        while seen < (newest := store.last_event):
-            try:
-                events = await to_thread.run_sync(partial(store.events_after, seen, feeder=feeder))
-            except StoreUnavailable:
-                return  # The client reconnects with the number of its last event.
-            for event in events:
-                seen = event.seq
-                if not caller.sees(event.alarm.feeder):
-                    continue
-                data = _EVENT.dump_json(event).decode()
-                yield ServerSentEvent(event="alarm", id=str(event.seq), raw_data=data)
-            if not events:
-                seen = newest
+    start = after if last_event_id is None else last_event_id
+    async with aclosing(_stream(Permission(request, caller), backend, "alarm", feeder, start)) as stream:
+        async for event in stream:
+            yield event
 
 
 @_alarms.get("/{alarm_id}")
@@ -235,27 +280,18 @@ def _listed(backend: Backend, alarms: Iterable[Alarm]) -> list[models.ListedAlar
     ]
 
 
-def _alarm(backend: Backend, caller: Identity, alarm_id: str) -> Alarm:
-    """An alarm within the caller's scope."""
-    alarm = backend.store.alarm(alarm_id)
-    if alarm is None or not caller.sees(alarm.feeder):
-        raise AlarmUnknown(alarm_id)
-    return alarm
-
-
 @_alarms.get("/{alarm_id}/events")
 def get_events(
     backend: BackendHere,
     caller: Caller,
     alarm_id: AlarmId,
-    after: Annotated[int, Query(ge=0, le=MAX_EVENT, description="Only events with a higher number.")] = 0,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    after: After = 0,
+    limit: Limit = 100,
 ) -> models.AlarmEvents:
     """A page of events of an alarm, oldest first."""
     _alarm(backend, caller, alarm_id)
-    found = backend.store.events(alarm_id, after=after, limit=limit + 1)
-    page = found[:limit]
-    return models.AlarmEvents(events=page, next=page[-1].seq if len(found) > limit else None)
+    page, following = _events(partial(backend.store.events, alarm_id), after, limit)
+    return models.AlarmEvents(events=page, next=following)
 
 
 @_alarms.post("/ack", dependencies=[Depends(json_only)])
@@ -332,7 +368,7 @@ def list_incidents(  # one argument per query parameter
         Query(description="Latest first; or those to act on first, and of these the most severe."),
     ] = "onset",
     cursor: Cursor = None,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    limit: Limit = 100,
 ) -> Any:
     """A page of incidents; `since` and `until` refer to `t_first` and `t_last`."""
     _within(caller, feeder)
@@ -376,16 +412,13 @@ def list_incidents(  # one argument per query parameter
 def list_incident_events(
     backend: BackendHere,
     caller: Caller,
-    after: Annotated[int, Query(ge=0, le=MAX_EVENT, description="Only events with a higher number.")] = 0,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    after: After = 0,
+    limit: Limit = 100,
 ) -> models.IncidentEvents:
     """A page of the events of all incidents, oldest first."""
-    found = backend.store.incident_events_after(after, limit=limit + 1)
-    page = found[:limit]
-    return models.IncidentEvents(
-        events=[event for event in page if caller.sees(event.incident.feeder)],
-        next=page[-1].seq if len(found) > limit else None,
-    )
+    page, following = _events(backend.store.incident_events_after, after, limit)
+    seen = [event for event in page if caller.sees(event.incident.feeder)]
+    return models.IncidentEvents(events=seen, next=following)
 
 
 @_incidents.get(
@@ -395,36 +428,18 @@ async def stream_incidents(  # noqa: PLR0917  # one argument per query parameter
     request: Request,
     backend: BackendHere,
     caller: Caller,
-    feeder: Annotated[str | None, Query(pattern=NAME, description="Restrict to this feeder.")] = None,
-    after: Annotated[int | None, Query(ge=0, description="Begin after this event number.")] = None,
-    last_event_id: Annotated[int | None, Header(ge=0, description="Takes precedence over `after`.")] = None,
+    feeder: StreamFeeder = None,
+    after: StreamAfter = None,
+    last_event_id: LastEvent = None,
 ) -> AsyncIterator[ServerSentEvent]:
     """Server-sent events `incident`, with event numbers as ids: with `Last-Event-ID` none is missed.
 
     Without it and without `after`, the stream starts with the next event.
     """
-    _within(caller, feeder)
-    store = backend.store
-    start = last_event_id if last_event_id is not None else after
-    newest = store.last_incident_event
-    seen = newest if start is None else min(start, newest)
-    yield ServerSentEvent(comment="connected", id=str(seen), retry=2000)
-    permission = Permission(request, caller)
-    async for _ in wakes(backend):
-        if not await permission.lasts():
-            return
-        while seen < (newest := store.last_incident_event):
-            try:
-                events = await to_thread.run_sync(partial(store.incident_events_after, seen, feeder=feeder))
-            except StoreUnavailable:
-                return  # The client reconnects with the number of its last event.
-            for event in events:
-                seen = event.seq
-                if caller.sees(event.incident.feeder):
-                    data = _INCIDENT_EVENT.dump_json(event).decode()
-                    yield ServerSentEvent(event="incident", id=str(event.seq), raw_data=data)
-            if not events:
-                seen = newest
+    start = after if last_event_id is None else last_event_id
+    async with aclosing(_stream(Permission(request, caller), backend, "incident", feeder, start)) as stream:
+        async for event in stream:
+            yield event
 
 
 @_incidents.get("/{incident_id}")
@@ -433,27 +448,18 @@ def get_incident(backend: BackendHere, caller: Caller, incident_id: IncidentId) 
     return _incident(backend, caller, incident_id)
 
 
-def _incident(backend: Backend, caller: Identity, incident_id: str) -> Incident:
-    """An incident within the caller's scope."""
-    incident = backend.store.incident(incident_id)
-    if incident is None or not caller.sees(incident.feeder):
-        raise IncidentUnknown(incident_id)
-    return incident
-
-
 @_incidents.get("/{incident_id}/events")
 def get_incident_events(
     backend: BackendHere,
     caller: Caller,
     incident_id: IncidentId,
-    after: Annotated[int, Query(ge=0, le=MAX_EVENT, description="Only events with a higher number.")] = 0,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    after: After = 0,
+    limit: Limit = 100,
 ) -> models.IncidentEvents:
     """A page of events of an incident, oldest first."""
     _incident(backend, caller, incident_id)
-    found = backend.store.incident_events(incident_id, after=after, limit=limit + 1)
-    page = found[:limit]
-    return models.IncidentEvents(events=page, next=page[-1].seq if len(found) > limit else None)
+    page, following = _events(partial(backend.store.incident_events, incident_id), after, limit)
+    return models.IncidentEvents(events=page, next=following)
 
 
 @_incidents.post("/{incident_id}/ack", dependencies=[Depends(json_only)])
@@ -552,9 +558,7 @@ async def end_shelf(
 ) -> Shelf:
     """End a shelf before its time."""
     who = operator_of(caller, answer.who)
-    found = await to_thread.run_sync(backend.store.shelf, shelf_id)
-    if found is None or not caller.sees(found.feeder):
-        raise ShelfUnknown(shelf_id)
+    await to_thread.run_sync(_found, caller, backend.store.shelf, ShelfUnknown, shelf_id)
     return await backend.operate(lambda act: act.unshelve(shelf_id, who, answer.comment))
 
 
@@ -589,9 +593,7 @@ async def end_work(
 ) -> PlannedWork:
     """End planned work before its time, or cancel it."""
     who = operator_of(caller, answer.who)
-    found = await to_thread.run_sync(backend.store.work, work_id)
-    if found is None or not caller.sees(found.feeder):
-        raise WorkUnknown(work_id)
+    await to_thread.run_sync(_found, caller, backend.store.work, WorkUnknown, work_id)
     return await backend.operate(lambda act: act.end_work(work_id, who, answer.comment))
 
 

@@ -164,7 +164,7 @@ class Permission:
     """Permission of an open stream, verified again every `FRESH_S`."""
 
     def __init__(self, request: Request, caller: Identity) -> None:
-        self._request, self._caller, self._verified = request, caller, time.monotonic()
+        self._request, self.caller, self._verified = request, caller, time.monotonic()
 
     async def lasts(self) -> bool:
         """True while the credential is valid and stands for the same identity."""
@@ -177,7 +177,7 @@ class Permission:
             now = await to_thread.run_sync(authenticator.identify, self._request, limiter=threads)
         except GridsecError:
             return False
-        return now == self._caller
+        return now == self.caller
 
 
 def operator_of(identity: Identity, given: str | None) -> str:

@@ -10,6 +10,7 @@ from ipaddress import ip_address
 from typing import Any, cast
 from urllib.parse import urlsplit
 
+import structlog
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
@@ -18,11 +19,13 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from feeders.registry import EstimatorUnusable
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable
 from service.access.identity import IssuerUnavailable, NotAuthenticated, NotPermitted, TooManyFailures
-from service.alarms.incidents import IncidentChanged, IncidentUnknown, ShelfUnknown, WorkUnknown, WrongTime
-from service.alarms.state_machine import AlarmUnknown, AlreadyAcknowledged, NotAcknowledged, RaisedAgain
+from service.alarms.incidents import IncidentChanged, WrongTime
+from service.alarms.state_machine import AlreadyAcknowledged, NotAcknowledged, RaisedAgain
 from service.engine.commissioning import NothingToLearn
-from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, TooManyFeeders
+from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, IdUnknown, TooManyFeeders
 from service.store import OutcomeUnknown, StoreUnavailable
+
+_log = structlog.get_logger("gridsec.http")
 
 
 class _HeadersSent(Exception):
@@ -97,7 +100,7 @@ class Guard:
 
     DNS rebinding: a foreign page can point its host name at this server. A request that changes something
     must therefore use an address or a host name of this server, and a page that sends it must have the same
-    origin.
+    origin: scheme, host and port. Behind a proxy with TLS that is `https` and one of `hosts`.
 
     max_body: largest request body, bytes.
     hosts: host names of this server, besides `localhost` and the machine's name.
@@ -120,11 +123,12 @@ class Guard:
                 421,
                 f"{host!r} is not a host name of this service; `--http-host` of `gridsec serve` adds one",
             )
-        if (
-            origin is None
-            or origin.partition("://")[2].lower() == host.lower()
-            or _name_of(origin) in self.hosts
-        ):
+        if origin is None:
+            return None
+        page = _origin(origin)
+        if page is not None and page == _origin(f"{request.url.scheme}://{host}"):
+            return None
+        if page is not None and page[0] == "https" and page[1] in self.hosts:
             return None
         return 403, f"a page of {origin!r} must not change anything at {host!r}"
 
@@ -172,6 +176,16 @@ def _name_of(address: str) -> str:
         return ""
 
 
+def _origin(address: str) -> tuple[str, str, int | None] | None:
+    """Scheme, host and port of an address (RFC 6454), with the default port; None for a wrong one."""
+    try:
+        parts = urlsplit(address)
+        port = parts.port or {"http": 80, "https": 443}.get(parts.scheme)
+    except ValueError:
+        return None
+    return (parts.scheme, parts.hostname, port) if parts.hostname else None
+
+
 def _is_address(name: str) -> bool:
     try:
         ip_address(name)
@@ -190,10 +204,7 @@ _STATUS: dict[type[GridsecError], int] = {
     NotObservable: 422,
     DesignInfeasible: 422,
     EstimatorUnusable: 422,
-    AlarmUnknown: 404,
-    IncidentUnknown: 404,
-    ShelfUnknown: 404,
-    WorkUnknown: 404,
+    IdUnknown: 404,
     WrongTime: 422,
     FeederUnknown: 404,
     AlreadyAcknowledged: 409,
@@ -226,8 +237,11 @@ def _gridsec_handler(status: int) -> Handler:
             more["problems"] = list(error.problems)
         if isinstance(error, OutcomeUnknown):
             more["outcome"] = "unknown"
-        headers = _ADVICE.get(status)
-        return problem(request, status, str(error), headers=headers, **more)
+        detail = str(error)
+        if isinstance(error, StoreUnavailable):
+            _log.warning("a request failed for the database", path=request.url.path, problem=detail)
+            detail = error.public
+        return problem(request, status, detail, headers=_ADVICE.get(status), **more)
 
     return handler
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import Annotated, Any
 
+import structlog
 from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import JSONResponse
@@ -19,7 +21,9 @@ from service.api.errors import problem
 from service.notify.delivery import Notifier
 from service.settings import is_loopback
 from service.store import Store, StoreUnavailable
+from service.store.deliveries import DeliveryStore
 
+_log = structlog.get_logger("gridsec.http")
 ANSWER_S = 0.7
 """Time limit of the test write, s: `/readyz` answers within 1 s."""
 
@@ -45,14 +49,15 @@ class Probe:
         await asyncio.wait({self._running}, timeout=ANSWER_S)
         if self._running.done():
             return self._running.result()
-        return f"{self._store.name}: no answer within {ANSWER_S:g} s"
+        return f"the database gives no answer within {ANSWER_S:g} s"
 
     async def _check(self) -> str | None:
         # In a separate thread: reads that wait for the database may occupy all shared ones.
         try:
             await to_thread.run_sync(self._access, limiter=CapacityLimiter(1), abandon_on_cancel=True)
         except StoreUnavailable as error:
-            return str(error)
+            _log.warning("the test write failed", problem=str(error))
+            return error.public
         return None
 
     def _access(self) -> None:
@@ -92,7 +97,7 @@ async def readyz(request: Request, backend: BackendHere) -> Any:
     ready, reasons = backend.ready()
     trouble = await request.app.state.probe.trouble()
     if trouble is not None:
-        ready, reasons = False, [*reasons, *([] if any(trouble in one for one in reasons) else [trouble])]
+        ready, reasons = False, list(dict.fromkeys([*reasons, trouble]))
     return _probe(request, ready, reasons, "the service cannot monitor at present")
 
 
@@ -138,21 +143,22 @@ def list_dead_letters(
 @_notifications.post("/dead-letters/resend", dependencies=[Depends(json_only)])
 def resend_dead_letters(request: Request, choice: models.LetterChoice) -> models.LetterCount:
     """Send dead letters again, with the same message ids; a delivered one is deleted."""
-    notifier: Notifier | None = request.app.state.notifier
-    if notifier is None:
-        return models.LetterCount(count=0)
-    count = notifier.store.resend(target=choice.target, ids=choice.ids)
-    notifier.look()
-    return models.LetterCount(count=count)
+    return _change_letters(request, DeliveryStore.resend, choice)
 
 
 @_notifications.post("/dead-letters/discard", dependencies=[Depends(json_only)])
 def discard_dead_letters(request: Request, choice: models.LetterChoice) -> models.LetterCount:
     """Delete dead letters."""
+    return _change_letters(request, DeliveryStore.discard, choice)
+
+
+def _change_letters(
+    request: Request, change: Callable[..., int], choice: models.LetterChoice
+) -> models.LetterCount:
     notifier: Notifier | None = request.app.state.notifier
     if notifier is None:
         return models.LetterCount(count=0)
-    count = notifier.store.discard(target=choice.target, ids=choice.ids)
+    count = change(notifier.store, target=choice.target, ids=choice.ids)
     notifier.look()
     return models.LetterCount(count=count)
 

@@ -103,6 +103,8 @@ _INCIDENTS: dict[str, Any] = {
     "planned_work": _TEXT,
     "planned_until": _TIME,
 }
+_FORMULA: Final = r"^([=+\-@\t\r])"
+"""Begin of a text that a spreadsheet evaluates as a formula (OWASP, CSV injection)."""
 _PREFIXED: Final = ("seen", "suspect", "model_only")
 """Fields of a meter with the name of a field of the whole feeder."""
 
@@ -229,12 +231,14 @@ def encoded(table: pa.Table, media: str) -> bytes:
 
 
 def _flat(table: pa.Table) -> pa.Table:
-    """Replace lists by texts with semicolons, and timestamps by texts as in RFC 3339."""
+    """Replace lists by texts with semicolons, and timestamps by texts as in RFC 3339; escape formulas."""
     from pyarrow import compute
 
+    escaped = partial(compute.replace_substring_regex, pattern=_FORMULA, replacement=r"'\1")
     texts: dict[Callable[[Any], bool], Callable[[Any], Any]] = {
         pa.types.is_timestamp: partial(compute.strftime, format="%Y-%m-%dT%H:%M:%SZ"),
-        pa.types.is_list: lambda column: compute.binary_join(column, ";"),
+        pa.types.is_list: lambda column: escaped(compute.binary_join(column, ";")),
+        pa.types.is_string: escaped,
     }
     for k, field in enumerate(table.schema):
         for is_kind, made in texts.items():

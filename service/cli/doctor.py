@@ -18,13 +18,16 @@ from importlib import metadata
 from importlib.util import find_spec
 from shutil import which
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 import typer
 
 from service.cli.console import FAILED, say
-from service.cli.serve import Database, Endpoints, EstimatorName, Feeders, Http, Listen
+from service.cli.serve import Database, Endpoints, EstimatorName, Feeders, Http, Listen, Notify
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from feeders.model.site import Site
     from service.settings import Settings
     from service.store.inspection import DatabaseState
@@ -76,6 +79,7 @@ def doctor(
     zenoh_connect: Endpoints = None,
     feeder: Feeders = None,
     estimator: EstimatorName = None,
+    notify: Notify = None,
 ) -> None:
     """Check everything that `gridsec serve` needs; exit code 1 if a line is FAIL.
 
@@ -91,6 +95,7 @@ def doctor(
             "zenoh_connect": tuple(zenoh_connect) if zenoh_connect else None,
             "feeders": tuple(feeder) if feeder else None,
             "estimator": estimator,
+            "notify": notify,
         }
     )
     failed = False
@@ -112,6 +117,7 @@ def examine(chosen: Settings) -> Iterator[Finding]:
     meters, feeders = _feeders(chosen, {} if state is None else state.feeders)
     yield from feeders
     yield _descriptors(meters)
+    yield from _notifications(chosen.notify)
     yield from _optional(postgresql=chosen.database.startswith("postgresql"))
 
 
@@ -270,6 +276,44 @@ def _descriptors(meters: int) -> Finding:
         text += f"; {meters} meters with a session each need a hard limit of {needed} (LimitNOFILE)"
         return Finding(Level.NOTE, "descriptors", text)
     return Finding(Level.OK, "descriptors", text)
+
+
+def _notifications(file: Path | None) -> Iterator[Finding]:
+    """Findings about the targets of notifications. Names are resolved; no connection is made."""
+    import ssl
+
+    from gridsec.errors import InputInvalid
+    from service.notify.post import AddressRefused, permitted
+    from service.notify.targets import Target, read_targets
+
+    def checked(target: Target) -> Finding:
+        parts = urlsplit(target.url)
+        name = f"{target.name} ({target.kind}), {target.host}"
+        try:
+            ssl.create_default_context(cafile=target.ca_file)
+        except OSError as error:
+            text = f"{name}: ca_file {target.ca_file}: {error.strerror or error}"
+            return Finding(Level.FAIL, "notify", text)
+        try:
+            found = permitted(target.host, parts.port or 443, target.private_addresses)
+        except AddressRefused as error:
+            return Finding(Level.FAIL, "notify", f"{name}: {error}")
+        except (OSError, UnicodeError) as error:
+            text = f"{name}: the name cannot be resolved: {getattr(error, 'strerror', None) or error}"
+            return Finding(Level.NOTE, "notify", text)
+        return Finding(
+            Level.OK, "notify", f"{name}: {', '.join(sorted({str(each[4][0]) for each in found}))}"
+        )
+
+    if file is None:
+        return
+    try:
+        targets = read_targets(file)
+    except InputInvalid as error:
+        for problem in error.problems:
+            yield Finding(Level.FAIL, "notify", " ".join(problem.split()))
+        return
+    yield from map(checked, targets.all)
 
 
 def _optional(*, postgresql: bool) -> Iterator[Finding]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.markup import escape
@@ -121,13 +121,8 @@ def resend(
     database: Database = DATABASE,
 ) -> None:
     """Send dead letters again, with the same message ids: by the running service, or after its next start."""
-    from service.store.deliveries import DeliveryStore
-
     ids = _chosen(letters, target, everything=everything)
-    with DeliveryStore(database) as store:
-        audit_command(database, "notify resend", target or "all", _numbers(ids))
-        count = store.resend(target=target, ids=ids)
-    console.say(f"{count} dead letters are sent again by the service.")
+    console.say(f"{_change('resend', ids, target, database)} dead letters are sent again by the service.")
 
 
 @app.command()
@@ -139,13 +134,21 @@ def discard(
     database: Database = DATABASE,
 ) -> None:
     """Delete dead letters."""
+    ids = _chosen(letters, target, everything=everything)
+    console.say(f"{_change('discard', ids, target, database)} dead letters are deleted.")
+
+
+def _change(
+    action: Literal["resend", "discard"], ids: list[int] | None, target: str | None, database: str
+) -> int:
+    """Change dead letters after an entry of the audit log; return their number."""
     from service.store.deliveries import DeliveryStore
 
-    ids = _chosen(letters, target, everything=everything)
     with DeliveryStore(database) as store:
-        audit_command(database, "notify discard", target or "all", _numbers(ids))
-        count = store.discard(target=target, ids=ids)
-    console.say(f"{count} dead letters are deleted.")
+        numbers = "" if ids is None else ", ".join(map(str, ids))
+        audit_command(database, f"notify {action}", target or "all", numbers)
+        change = store.resend if action == "resend" else store.discard
+        return change(target=target, ids=ids)
 
 
 def _targets(file: Path) -> Targets:
@@ -163,10 +166,6 @@ def _chosen(letters: list[int] | None, target: str | None, *, everything: bool) 
     if given != 1:
         raise typer.BadParameter("expected numbers of dead letters, --target, or --all")
     return letters or None
-
-
-def _numbers(ids: list[int] | None) -> str:
-    return "" if ids is None else ", ".join(map(str, ids))
 
 
 def _when(t: float | None) -> str:

@@ -45,15 +45,16 @@ from service.engine.load import FeederLoad, LoadControl
 from service.engine.operators import SHELVE_MOST_S, Operators
 from service.errors import FeederUnknown
 from service.ingest.align import Clock
+from service.ingest.decode import Wire
 from service.ingest.queues import Inbox, Sample
-from service.ingest.reading import BadReading, BadReason, Reading, Readings, Wire, head_of
+from service.ingest.reading import BadReading, BadReason, Reading, Readings, head_of
 from service.metrics import Metrics
 from service.report.report import BUSBAR, FeederReport
 from service.report.tick_state import TickState
 from service.store import Rejected, Store
 from service.store.committer import Committer, Executor, Wish, alarm_key, incident_key, inline
 from service.store.schema import CommissioningEvent
-from service.store.state_codec import StateSnapshot
+from service.store.state_codec import KeptInvalid, StateSnapshot, decode_signed, encode_signed
 from service.store.store import Mark, mark, worth_keeping
 
 BAD_PER_SOURCE = 5
@@ -107,6 +108,9 @@ BUDGET_S = 1.0
 
 CALM_S = 60.0
 """Time without a skipped tick, s, after which the next one is logged again."""
+
+ORDER_S = 2.0
+"""Interval of writes of the order of signed readings, s: `kill -9` loses the order of this time."""
 
 SHOWN = 5
 """Largest number of feeders in one line of the log."""
@@ -198,11 +202,12 @@ class RuntimeConfig:
 
 @dataclass(frozen=True, slots=True)
 class PersistedState:
-    """State of a feeder for the warm start of a monitor: alarms, commissioning, suspicions."""
+    """State of a feeder for the warm start: alarms, commissioning, suspicions, order of signed readings."""
 
     alarms: tuple[Alarm, ...]
     commission: StateSnapshot | None
     distrust: StateSnapshot | None
+    signed: StateSnapshot | None = None
 
 
 class Engine:
@@ -244,7 +249,7 @@ class Engine:
         self._wire = Wire({}, config.prefix, config.max_payload, config.meter_keys)
         self._marks: dict[str, Mark] = {}
         self._wakes: dict[str, float] = {}
-        self._until = -math.inf
+        self._until = self._order_kept = -math.inf
         self.load = LoadControl(clock)
         for site in sites:
             self.add(site)
@@ -276,14 +281,25 @@ class Engine:
         if name in self.load.shed:
             monitor.set_shed(True)
         self.unloaded.pop(name, None)
+        self._restore_order(name, past.signed)
         self._learn()
         return monitor
+
+    def _restore_order(self, name: str, kept: StateSnapshot | None) -> None:
+        """Continue the order of a feeder's signed readings."""
+        if kept is None or self.config.meter_keys is None:
+            return
+        try:
+            self.config.meter_keys.restore(name, decode_signed(name, kept))
+        except KeptInvalid as error:
+            _log.error("the stored order of signed readings is not used", feeder=name, problem=str(error))
 
     def _past(self, name: str, store: Store) -> PersistedState:
         # With `Clock.EVENTS` the latest tick may be long ago; `advance` drops alarms that are too old.
         latest = min([self._wall(), *(tick["t"] for tick in store.history(name, limit=1))])
         alarms = store.active(name, cleared_since=latest - AlarmRules().memory_s)
-        return PersistedState(tuple(alarms), store.commission(name), store.distrust(name))
+        signed = None if self.config.meter_keys is None else store.signed(name)
+        return PersistedState(tuple(alarms), store.commission(name), store.distrust(name), signed)
 
     def put(
         self, site: Site, tables: Mapping[str, Any], installed: Callable[[FeederMonitor], None]
@@ -315,6 +331,7 @@ class Engine:
             monitor.book.alarms,
             monitor.commissioning.now() or stored.commission,
             monitor.suspicions.now() or stored.distrust,
+            stored.signed,
         )
 
     def remove(self, name: str) -> Future[None]:
@@ -389,6 +406,7 @@ class Engine:
         """
         started, begun = time.perf_counter(), time.thread_time()
         bad = self._place(samples)
+        self._keep_order(at_once=False)
         self._reach(self._wall(), oldest())
         placed = time.thread_time()
         results = self._judge()
@@ -540,6 +558,7 @@ class Engine:
 
         `monitors` None: all. With `at_once` it includes a commissioning that is not due yet.
         """
+        self._keep_order(at_once=at_once)
         for monitor in self.monitors.values() if monitors is None else monitors:
             kept, happened = monitor.commissioning.due(at_once=at_once)
             self.committer.waiting.add(kept=(*kept, *monitor.suspicions.due()), happened=happened)
@@ -547,6 +566,15 @@ class Engine:
                 _say(one)
             if happened:
                 self._count_learned(monitor)
+
+    def _keep_order(self, *, at_once: bool) -> None:
+        """Queue the order of new signed readings for the database; without `at_once` every `ORDER_S`."""
+        keys, now = self.config.meter_keys, time.monotonic()
+        if keys is None or not keys.changed or (now - self._order_kept < ORDER_S and not at_once):
+            return
+        t, self._order_kept = self._wall(), now
+        self.committer.waiting.add(kept=[encode_signed(name, t, keys.orders(name)) for name in keys.changed])
+        keys.changed.clear()
 
     def _count_learned(self, monitor: FeederMonitor) -> None:
         known = monitor.commissioning.known

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -30,7 +30,8 @@ from service.engine.commissioning import FeederCommissioning
 from service.ingest.align import Aligner, AlignRules, Clock, Placed, ReadingOutcome, Tick, rules
 from service.ingest.reading import Known, Reading, Readings
 from service.report import feeder_info
-from service.report.report import BUSBAR, DataErrors, FeederReport, busbar_phases, snapshot
+from service.report.data_errors import DataErrors
+from service.report.report import BUSBAR, FeederReport, busbar_phases, snapshot
 from service.report.tick_state import TickState
 from service.store.state_codec import KeptInvalid, StateSnapshot, decode_distrust, encode_distrust
 
@@ -345,7 +346,8 @@ class FeederMonitor:
                 notable = state.notable(subjects)
                 connecting = self._connects(tick)
                 found = [] if notable is None else conditions(notable, connecting=connecting)
-                after, transitions = advance(book, self._alarm_rules, [*found, *mismatches], state.t)
+                held = self._unmeasured(book, tick)
+                after, transitions = advance(book, self._alarm_rules, [*found, *mismatches, *held], state.t)
             except Exception as error:  # noqa: BLE001 - ticks before and after keep their verdicts
                 self.break_down(error)
             else:
@@ -357,8 +359,18 @@ class FeederMonitor:
     def _unread(self, book: AlarmBook) -> list[Condition]:
         """Unknown conditions of alarms that depend on payloads which a shed feeder does not decode."""
         kinds = (AlarmKind.IDENTITY_MISMATCH, AlarmKind.CLOCK_OFFSET)
-        found = [key for key in book.entries if key[0] in kinds]
-        return [Condition(kind, self.name, meter, Severity.MAJOR, known=False) for kind, meter in found]
+        return self._unknown(key for key in book.entries if key[0] in kinds)
+
+    def _unmeasured(self, book: AlarmBook, tick: Tick) -> list[Condition]:
+        """Unknown conditions of alarms of clocks without a measured offset, as after a restart."""
+        if tick.clocks_known is None:
+            return []
+        measured = {BUSBAR if source is None else source for source in tick.clocks_known}
+        entries = (key for key in book.entries if key[0] is AlarmKind.CLOCK_OFFSET)
+        return self._unknown(key for key in entries if key[1] not in measured)
+
+    def _unknown(self, keys: Iterable[tuple[AlarmKind, str | None]]) -> list[Condition]:
+        return [Condition(kind, self.name, meter, Severity.MAJOR, known=False) for kind, meter in keys]
 
     def _connects(self, tick: Tick) -> bool:
         """True while a meter has had no reading since the start and is not silent yet."""

@@ -41,6 +41,7 @@ from service.alarms.state_machine import (
     unacknowledged,
 )
 from service.engine.feeder_monitor import FeederMonitor
+from service.errors import IdUnknown
 from service.store import OutcomeUnknown, Store
 from service.store.committer import Committer, Wish
 
@@ -298,7 +299,7 @@ class Operators:
         def guarded(db: Store) -> Any:
             try:
                 return read(db)
-            except (AlarmUnknown, IncidentUnknown) as error:
+            except IdUnknown as error:
                 return error
 
         self._engine.committer.look(guarded, run, partial(_refuse, answer))

@@ -151,7 +151,8 @@ class Runtime:
             await self._end()
             self._check_writer()
         except BaseException as error:
-            self._died = f"{type(error).__name__}: {error}"
+            text = error.public if isinstance(error, StoreUnavailable) else str(error)
+            self._died = f"{type(error).__name__}: {text}"
             raise
         finally:
             self.stop()

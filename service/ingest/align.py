@@ -63,6 +63,7 @@ class ClockOffsets:
     tick_s: interval of the ticks, s.
     silence_s: time without an arrival after which the delays of a source are deleted, s. The service's clock
         may be set meanwhile: delays of sources that no longer report would shift the median of all.
+    known: sources with enough delays at the latest measurement.
     """
 
     def __init__(self, sources: Iterable[str | None], tick_s: float, silence_s: float) -> None:
@@ -77,6 +78,7 @@ class ClockOffsets:
         self._least = max(LEAST_S, LEAST_TICKS * tick_s)
         self._silence = silence_s
         self._reported = np.zeros(size, dtype=np.bool_)
+        self.known: frozenset[str | None] = frozenset()
 
     def note(self, source: str | None, t: float, arrival: float) -> None:
         """Add the delay of one reading. `source` is the meter, None for the busbar meter; times in Unix s."""
@@ -109,6 +111,7 @@ class ClockOffsets:
         """Delete all delays: the wall clock was set."""
         self._delete(np.ones(self._count.size, dtype=np.bool_))
         self._reported[:] = False
+        self.known = frozenset()
 
     def _delete(self, which: Bools) -> None:
         self._delays[:, which] = np.inf
@@ -126,7 +129,9 @@ class ClockOffsets:
         enough = np.flatnonzero(self._count >= FEWEST)
         if enough.size < SOURCES:
             self._reported[:] = False
+            self.known = frozenset()
             return {}
+        self.known = frozenset(self._sources[k] for k in enough)
         middle = _medians(self._delays[:, enough], self._count[enough])
         off = float(np.median(middle)) - middle
         # Half of `least` is the lower bound of all limits and is cheaper.
@@ -285,6 +290,8 @@ class Tick:
     clock_offset: tuple[float | None, ...] = ()
     busbar_offset: float | None = None  # lead of the busbar meter's clock, s; None if not measurable
     v_phases: tuple[float, ...] | None = None  # voltages of the busbar's phases, V, as in `Reading`
+    # Sources with a measured clock offset, None for the busbar meter; None where the clock measures none.
+    clocks_known: frozenset[str | None] | None = None
 
     @property
     def seen(self) -> Bools:
@@ -844,7 +851,8 @@ class Aligner:
             offsets = tuple(found.get(meter) for meter in self.meters)
             self._offsets = offsets if any(offsets) else ()
         phases = self._phases.get(float(values[T, -1])) if self._phases else None
-        return Tick(t, values, silent, skipped, self._offsets, self._busbar_offset, phases)
+        known = self._clocks.known if self.rules.clock is Clock.WALL else None
+        return Tick(t, values, silent, skipped, self._offsets, self._busbar_offset, phases, known)
 
 
 def _empty(slots: int, sources: int) -> Floats:

@@ -16,9 +16,9 @@ from feeders.model.site import Site, volts
 from gridsec.arrays import Bools, Floats
 from gridsec.interface import Cause, Decision, Estimate, Verdict
 from service.ingest.align import Tick
+from service.report.data_errors import DataErrorReport
 from service.report.report import (
     BUSBAR,
-    DataErrorReport,
     DisplayedVerdict,
     FeederReport,
     LearningReport,

@@ -305,7 +305,7 @@ class Committer:
 
     waiting: data that wait for the database.
     publisher: destination of alarms, or None.
-    problem: reason why the database cannot be used, or None.
+    problem, public: reason why the database cannot be used, or None; the sentence of it for clients.
     storing: True while a write is in progress; only `waiting` and `commit` may be used then.
     metrics: counters of failures and transitions.
     stored: called after alarms have been stored.
@@ -327,6 +327,7 @@ class Committer:
         self.waiting = WriteQueue(lambda what, count: metrics.forgotten.labels(what).inc(count))
         self.publisher: Publisher | None = None
         self.problem: str | None = None
+        self.public = ""
         self.storing = False
         self._store = store
         self._metrics = metrics
@@ -487,9 +488,9 @@ class Committer:
             self._stored()
 
     def _refused(self, error: StoreUnavailable) -> None:
-        if self.problem is None:
+        if self.problem is None or error.public != self.public:
             _log.error("the database cannot be used; alarms are kept and tried again", problem=str(error))
-        self.problem = str(error)
+        self.problem, self.public = str(error), error.public
         self._retry_at = time.monotonic() + RETRY_S
         self._metrics.store_failures.inc()
 
@@ -498,7 +499,7 @@ class Committer:
         under_way = time.monotonic() - self._began if self.storing else 0.0
         if self.problem is None and under_way < SLOW_S:
             return []
-        problems = [] if self.problem is None else [f"database: {self.problem}"]
+        problems = [] if self.problem is None else [self.public]
         if under_way >= SLOW_S:
             problems.append(f"database: a write has been under way for {under_way:.0f} s")
         if waiting := len(self.waiting):
@@ -599,14 +600,18 @@ def missed(store: Reader, kind: str, after: int, limit: int) -> list[StoredEvent
     """Return the stored events after a number for subscribers that missed them, oldest first.
 
     kind: `alarm` or `incident`, with the keys and payloads of their publication.
-    Raises StoreUnavailable if the database cannot be read.
+    Raises StoreUnavailable, with a sentence for clients, if the database cannot be read.
     """
-    if kind == "alarm":
+    try:
+        if kind == "alarm":
+            return [
+                StoredEvent(alarm_key(event.alarm), msgspec.json.encode(alarm_json(event.alarm)), event.seq)
+                for event in store.events_after(after, limit=limit)
+            ]
         return [
-            StoredEvent(alarm_key(event.alarm), msgspec.json.encode(alarm_json(event.alarm)), event.seq)
-            for event in store.events_after(after, limit=limit)
+            StoredEvent(incident_key(event.incident), msgspec.json.encode(event_json(event)), event.seq)
+            for event in store.incident_events_after(after, limit=limit)
         ]
-    return [
-        StoredEvent(incident_key(event.incident), msgspec.json.encode(event_json(event)), event.seq)
-        for event in store.incident_events_after(after, limit=limit)
-    ]
+    except StoreUnavailable as error:
+        _log.warning("missed events cannot be read", problem=str(error))
+        raise StoreUnavailable(error.public, code=error.code) from error

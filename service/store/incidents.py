@@ -333,22 +333,10 @@ class IncidentReader:
         Returns incidents, cursor: the cursor is None on the last page.
         """
         i = INCIDENT.c
-        wanted: list[sa.ColumnElement[bool]] = [
-            column.in_([str(value) for value in allowed])
-            for column, allowed in ((i.state, state), (i.kind, kind), (i.severity, severity))
-            if allowed
-        ]
-        if feeder is not None:
-            wanted.append(i.feeder == feeder)
-        if among is not None:
-            wanted.append(i.feeder.in_(among))
+        allowed = {"state": state, "kind": kind, "severity": severity, "feeder": feeder}
+        wanted = filters(i, among, text, (since, until), (i.t_first, i.t_last), **allowed)
         if meter is not None:
             wanted.append(i.id.in_(sa.select(ALARM.c.incident).where(ALARM.c.meter == meter)))
-        if since is not None:
-            wanted.append(i.t_last >= since)
-        if until is not None:
-            wanted.append(i.t_first < until)
-        wanted += words_in(i.words, text)
         if assigned_to is not None:
             wanted.append(i.assigned_to == assigned_to if assigned_to else i.assigned_to.is_(None))
         for column, given in ((i.shelved_until, shelved), (i.planned_until, planned)):
@@ -361,11 +349,8 @@ class IncidentReader:
         )
         worst = rank_of(i.severity) + sa.case((to_do, len(_RANK)), else_=0)
         keys = {"onset": None, "severity": worst, "last": i.t_last}
-        query, key = sorted_by(sa.select(i.id, i.data).where(*wanted), i.id, keys[sort], cursor)
-        with self._read() as connection:
-            rows = connection.execute(query.limit(limit + 1)).all()
-        page = [incident_of(json.loads(row.data)) for row in rows[:limit]]
-        return page, (key(rows[limit - 1]) if len(rows) > limit else None)
+        rows, following = page(self._read, i, wanted, keys[sort], cursor, limit)
+        return [incident_of(data) for data in rows], following
 
     def open_incidents(self, *, among: Collection[str] | None = None) -> int:
         """Number of incidents with an alarm that is neither acknowledged, shelved nor under planned work."""
@@ -378,7 +363,7 @@ class IncidentReader:
         with self._read() as connection:
             return int(connection.execute(query).scalar_one())
 
-    def incident_events(self, incident_id: str, *, after: int = 0, limit: int = 1000) -> list[IncidentEvent]:
+    def incident_events(self, incident_id: str, after: int = 0, *, limit: int = 1000) -> list[IncidentEvent]:
         """Return the events of an incident, oldest first. `after` restricts to a higher number."""
         e = INCIDENT_EVENT.c
         query = sa.select(INCIDENT_EVENT).where(e.incident_id == incident_id, e.seq > after)
@@ -523,9 +508,32 @@ def _event(row: sa.RowMapping) -> IncidentEvent:
     )
 
 
-def words_in(column: sa.ColumnElement[str], text: str | None) -> list[sa.ColumnElement[bool]]:
-    """Return the conditions that a column in lower case contains each word of a text."""
-    return [column.contains(word, autoescape=True) for word in (text or "").lower().split()]
+Columns = sa.sql.base.ReadOnlyColumnCollection[str, sa.Column[Any]]
+
+
+def filters(
+    c: Columns,
+    among: Collection[str] | None,
+    text: str | None,
+    span: tuple[float | None, float | None],
+    times: tuple[sa.Column[float], sa.Column[float]],
+    **allowed: Collection[str] | str | None,
+) -> list[sa.ColumnElement[bool]]:
+    """Return the conditions of filters that alarms and incidents share; c has the columns.
+
+    among, text, span: as in `incidents`; span is (since, until), Unix s.
+    times: columns of the first and last raising, Unix s.
+    allowed: permitted value or values by column; None or empty for all.
+    """
+    found: list[sa.ColumnElement[bool]] = [
+        c[name] == value if isinstance(value, str) else c[name].in_([str(each) for each in value])
+        for name, value in allowed.items()
+        if value
+    ]
+    found += [] if among is None else [c.feeder.in_(among)]
+    found += [] if span[0] is None else [times[1] >= span[0]]
+    found += [] if span[1] is None else [times[0] < span[1]]
+    return found + [c.words.contains(word, autoescape=True) for word in (text or "").lower().split()]
 
 
 def rank_of(severity: sa.ColumnElement[str]) -> sa.ColumnElement[int]:
@@ -533,24 +541,30 @@ def rank_of(severity: sa.ColumnElement[str]) -> sa.ColumnElement[int]:
     return sa.case(_RANK, value=severity, else_=0)
 
 
-def sorted_by(
-    query: sa.Select[Any],
-    number: sa.ColumnElement[str],
+def page(  # noqa: PLR0917  # query, order and end of the previous page
+    read: Read,
+    c: Columns,
+    wanted: Iterable[sa.ColumnElement[bool]],
     key: sa.ColumnElement[Any] | None,
     cursor: str | None,
-) -> tuple[sa.Select[Any], Callable[[Any], str]]:
-    """Return a query in the order of a key and then of the id, both descending, after a cursor.
+    limit: int,
+) -> tuple[list[Any], str | None]:
+    """Return the JSON objects of a page of alarms or incidents, and its cursor; None on the last page.
 
-    number, key: columns of the id and of the key; key None: by id only.
-    Returns query, cursor: the query, and the cursor of a row of it.
+    key: order before that of the id, both descending; None: by id only.
     """
     value, _, last = (cursor or "").rpartition("~")
-    if key is None:
-        if cursor is not None:
-            query = query.where(number < last)
-        return query.order_by(number.desc()), lambda row: str(row.id)
-    query = query.add_columns(key.label("key")).order_by(key.desc(), number.desc())
-    if cursor is not None:
+    query, after = sa.select(c.id, c.data).where(*wanted), c.id < last
+    if key is not None:
+        query = query.add_columns(key.label("key")).order_by(key.desc())
         at = float(value or 0.0)
-        query = query.where(sa.or_(key < at, sa.and_(key == at, number < last)))
-    return query, lambda row: f"{float(row.key)!r}~{row.id}"
+        after = sa.or_(key < at, sa.and_(key == at, after))
+    if cursor is not None:
+        query = query.where(after)
+    with read() as connection:
+        rows = connection.execute(query.order_by(c.id.desc()).limit(limit + 1)).all()
+    following = None
+    if len(rows) > limit:
+        row = rows[limit - 1]
+        following = str(row.id) if key is None else f"{float(row.key)!r}~{row.id}"
+    return [json.loads(row.data) for row in rows[:limit]], following

@@ -41,6 +41,11 @@ class StoreUnavailable(GridsecError):
 
     code = "database-unavailable"
 
+    @property
+    def public(self) -> str:
+        """Sentence for clients, without address and message of the database."""
+        return f"the database cannot be used ({self.code}); the log of the service has the details"
+
 
 class OutcomeUnknown(StoreUnavailable):
     """The connection broke during the commit of a transaction: it is stored as a whole, or not at all."""
@@ -227,6 +232,7 @@ def _of_each_feeder(name: str) -> sa.Table:
 
 
 COMMISSION, DISTRUST = _of_each_feeder("commission"), _of_each_feeder("distrust")
+SIGNED = _of_each_feeder("signed_order")
 COMMISSION_EVENT = sa.Table(
     "commission_event",
     META,
@@ -310,6 +316,10 @@ def _add_incidents(connection: sa.Connection) -> None:
         connection.execute(ALARM.update().where(ALARM.c.id == number).values(words=words))
 
 
+def _add_signed(connection: sa.Connection) -> None:
+    SIGNED.create(connection)
+
+
 MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
     _add_commissioning,
     _add_distrust,
@@ -317,6 +327,7 @@ MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
     _add_writer,
     _add_rollup,
     _add_incidents,
+    _add_signed,
 )
 """Step k migrates schema version k + 1 to k + 2. A new database starts at the newest version."""
 

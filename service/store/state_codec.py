@@ -1,4 +1,4 @@
-"""Versioned JSON encoding of a feeder's persistent monitor state: commissioning and suspicions.
+"""Versioned JSON encoding of a feeder's persistent state: commissioning, suspicions, signed readings.
 
 Numbers are written with enough digits to restore the same float64, NaN as null.
 """
@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Any, Final, TypeAlias, TypeVar
@@ -22,6 +22,7 @@ from feeders.model.site import Site
 from gridsec.arrays import Floats
 from gridsec.errors import GridsecError
 from gridsec.estimators.sequential import SuspicionRecord
+from service.access.signing import SignedOrder
 from service.report.report import Phase, busbar_phases
 
 FORMAT: Final = 1
@@ -37,6 +38,7 @@ class SnapshotKind(StrEnum):
 
     COMMISSION = "commission"
     DISTRUST = "distrust"
+    SIGNED = "signed"
 
 
 class KeptInvalid(GridsecError):
@@ -99,7 +101,7 @@ def decode(site: Site, now: Mapping[str, str], kept: StateSnapshot) -> dict[str,
     `now` is the feeder's fingerprint. Returns the arrays of `encode`. Raises KeptInvalid if the text is
     damaged, newer than this program, or of a feeder that has changed since.
     """
-    record = _read(site, kept, CommissionRecord)
+    record = _read(site.feeder.name, kept, CommissionRecord)
     changed = [name for name in now if record.fingerprint.get(name) != now[name]]
     if changed:
         raise KeptInvalid(f"the feeder has changed since ({', '.join(changed)})", code="feeder-changed")
@@ -182,7 +184,7 @@ def decode_distrust(site: Site, kept: StateSnapshot) -> SuspicionRecord:
 
     Raises KeptInvalid if the text is damaged, newer than this program, or of another feeder.
     """
-    record, owners = _read(site, kept, DistrustRecord), _owners(site)
+    record, owners = _read(site.feeder.name, kept, DistrustRecord), _owners(site)
     who = {suspect.meter: suspect for suspect in record.meters}
     if len(who) < len(record.meters):
         raise KeptInvalid("it is damaged: a meter occurs twice", code="duplicate")
@@ -203,6 +205,30 @@ def decode_distrust(site: Site, kept: StateSnapshot) -> SuspicionRecord:
     )
 
 
+class SignedRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Contents of the text of the newest signed readings."""
+
+    format: int  # version of the text
+    # feeder, t: as in `StateSnapshot`.
+    feeder: str
+    t: _Finite
+    meters: list[SignedOrder]
+
+
+def encode_signed(feeder: str, t: float, orders: Iterable[SignedOrder]) -> StateSnapshot:
+    """Encode the newest signed readings of a feeder's meters. `t` is the wall clock, Unix s."""
+    record = SignedRecord(FORMAT, feeder, t, list(orders))
+    return StateSnapshot(feeder, t, msgspec.json.encode(record).decode(), SnapshotKind.SIGNED)
+
+
+def decode_signed(feeder: str, kept: StateSnapshot) -> list[SignedOrder]:
+    """Decode the newest signed readings of a feeder's meters.
+
+    Raises KeptInvalid if the text is damaged, newer than this program, or of another feeder.
+    """
+    return _read(feeder, kept, SignedRecord).meters
+
+
 def _owners(site: Site) -> list[tuple[str, int]]:
     """Customer of every inverter, and its index among the inverters of that customer."""
     count: Counter[str] = Counter()
@@ -219,10 +245,10 @@ class _Version(msgspec.Struct, frozen=True):
     format: Annotated[int, msgspec.Meta(ge=1)]
 
 
-_Text = TypeVar("_Text", CommissionRecord, DistrustRecord)
+_Text = TypeVar("_Text", CommissionRecord, DistrustRecord, SignedRecord)
 
 
-def _read(site: Site, kept: StateSnapshot, kind: type[_Text]) -> _Text:
+def _read(feeder: str, kept: StateSnapshot, kind: type[_Text]) -> _Text:
     """Return the contents of a text of this feeder."""
     try:
         version = msgspec.json.decode(kept.text, type=_Version).format
@@ -232,7 +258,7 @@ def _read(site: Site, kept: StateSnapshot, kind: type[_Text]) -> _Text:
         record = msgspec.json.decode(kept.text, type=kind)
     except msgspec.DecodeError as error:
         raise KeptInvalid(f"it is damaged: {error}", code="damaged") from error
-    if record.feeder != site.feeder.name:
+    if record.feeder != feeder:
         raise KeptInvalid(f"it belongs to feeder {record.feeder!r}", code="other-feeder")
     return record
 

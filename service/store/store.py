@@ -25,7 +25,7 @@ from service.alarms.state_machine import Alarm, AlarmState, AlarmTransition, Cha
 from service.report.report import FeederReport
 from service.store import incidents
 from service.store.connect import Connections
-from service.store.incidents import IncidentReader, rank_of, sorted_by, words_in
+from service.store.incidents import IncidentReader
 from service.store.rollups import AlarmSpan, add_rollups, prune_rollups, read_alarm_spans, read_series
 from service.store.schema import (
     ALARM,
@@ -39,6 +39,7 @@ from service.store.schema import (
     INCIDENT_EVENT,
     LAYOUT,
     OUTBOX,
+    SIGNED,
     WRITER,
     AlarmEvent,
     CommissioningChange,
@@ -109,29 +110,16 @@ class Reader(IncidentReader):
         Returns alarms, cursor: the cursor is None on the last page.
         """
         a = ALARM.c
-        query = sa.select(a.id, a.data).where(*words_in(a.words, text))
-        for column, allowed in ((a.state, state), (a.kind, kind), (a.severity, severity)):
-            if allowed:
-                query = query.where(column.in_([str(value) for value in allowed]))
-        for column, wanted in ((a.feeder, feeder), (a.meter, meter), (a.incident, incident)):
-            if wanted is not None:
-                query = query.where(column == wanted)
-        if among is not None:
-            query = query.where(a.feeder.in_(among))
-        if since is not None:
-            query = query.where(a.t_raised >= since)
-        if until is not None:
-            query = query.where(a.t_raised < until)
+        given = {"state": state, "kind": kind, "severity": severity, "feeder": feeder}
+        given |= {"meter": meter, "incident": incident}
+        wanted = incidents.filters(a, among, text, (since, until), (a.t_raised, a.t_raised), **given)
         if shelved is not None:
             any_shelf = sa.or_(sa.false(), *(_shelved_by(shelf) for shelf in self.shelves(standing=True)))
             now = sa.and_(a.state != str(AlarmState.CLEARED), any_shelf)
-            query = query.where(now if shelved else sa.not_(now))
-        keys = {"onset": None, "severity": rank_of(a.severity), "raised": a.t_raised}
-        query, key = sorted_by(query, a.id, keys[sort], cursor)
-        with self._read() as connection:
-            rows = connection.execute(query.limit(limit + 1)).all()
-        page = [from_json(json.loads(row.data)) for row in rows[:limit]]
-        return page, (key(rows[limit - 1]) if len(rows) > limit else None)
+            wanted.append(now if shelved else sa.not_(now))
+        keys = {"onset": None, "severity": incidents.rank_of(a.severity), "raised": a.t_raised}
+        rows, following = incidents.page(self._read, a, wanted, keys[sort], cursor, limit)
+        return [from_json(data) for data in rows], following
 
     def raised(self, *, among: Collection[str] | None = None) -> int:
         """Number of active alarms without an acknowledgement, of some feeders or (None) of all."""
@@ -167,7 +155,7 @@ class Reader(IncidentReader):
         with self._read() as connection:
             return [from_json(json.loads(data)) for data in connection.scalars(query)]
 
-    def events(self, alarm_id: str, *, after: int = 0, limit: int = 1000) -> list[AlarmEvent]:
+    def events(self, alarm_id: str, after: int = 0, *, limit: int = 1000) -> list[AlarmEvent]:
         """Return the events of an alarm, oldest first. `after` restricts to events with a higher number."""
         query = sa.select(EVENT).where(EVENT.c.alarm_id == alarm_id, EVENT.c.seq > after)
         query = query.order_by(EVENT.c.seq).limit(limit)
@@ -279,6 +267,10 @@ class Reader(IncidentReader):
         """Return the stored suspicions of a feeder, or None."""
         return self._kept(DISTRUST, feeder, SnapshotKind.DISTRUST)
 
+    def signed(self, feeder: str) -> StateSnapshot | None:
+        """Return the stored order of a feeder's signed readings, or None."""
+        return self._kept(SIGNED, feeder, SnapshotKind.SIGNED)
+
     def _kept(self, table: sa.Table, feeder: str, matter: SnapshotKind) -> StateSnapshot | None:
         c = table.c
         with self._read() as connection:
@@ -339,7 +331,11 @@ ALONE_S = 5.0
 _STEADY_S = 86_400.0
 """Time for which a feeder must have reported before anything is deleted, s."""
 _log = structlog.get_logger("gridsec.store")
-_KEPT = {SnapshotKind.COMMISSION: COMMISSION, SnapshotKind.DISTRUST: DISTRUST}
+_KEPT = {
+    SnapshotKind.COMMISSION: COMMISSION,
+    SnapshotKind.DISTRUST: DISTRUST,
+    SnapshotKind.SIGNED: SIGNED,
+}
 
 
 class Store(Reader):
@@ -378,6 +374,7 @@ class Store(Reader):
             raise
         self._last_event = int(newest or 0)
         self._last_incident_event = int(newest_incident or 0)
+        self._suppression_changes = 0
         if (beat_s := self._connections.beat_s) is not None:
             threading.Thread(
                 target=self._beat, args=(beat_s,), name="gridsec-store-beat", daemon=True
@@ -433,6 +430,11 @@ class Store(Reader):
         """Number of the newest event of an incident; without a call to the database."""
         return self._last_incident_event
 
+    @property
+    def suppression_changes(self) -> int:
+        """Number of commits of this store that may have changed shelves or planned works."""
+        return self._suppression_changes
+
     def due(self, now: float) -> bool:
         """True if a shelf or a planned work changes by `now`, Unix s; without a call to the database."""
         return self._due is not None and self._due <= now
@@ -475,7 +477,8 @@ class Store(Reader):
         reports: reports of the feeders; the history selects from them.
         rejected: rejected readings; the newest `BAD_READINGS_KEPT` are kept. Readings that the database
             cannot represent are dropped and logged.
-        kept, happened: state of the feeders' commissioning and suspicions, and changes of the former.
+        kept, happened: state of the feeders' commissioning, suspicions and signed readings, and changes of
+            the first.
         without: delete the tables of this feeder, its commissioning and its suspicions.
         put: a feeder and the columns of its files as JSON, which replace the stored ones.
         actions: actions of operators on incidents, shelves and planned works.
@@ -497,6 +500,7 @@ class Store(Reader):
             if not (grouped or worthy or rejected or kept or happened or without or put):
                 return ()
             newest, following = self._last_incident_event, self._due
+            suppressions = self._suppression_changes + bool(actions or self.due(now))
             with self._connections.write() as connection:
                 if key is not None and _stored_before(connection, key):
                     newer = sa.select(EVENT.c.seq).where(EVENT.c.seq > self._last_event)
@@ -522,7 +526,7 @@ class Store(Reader):
                     newest = connection.scalar(sa.select(sa.func.max(INCIDENT_EVENT.c.seq))) or 0
                     following = incidents.next_due(connection)
             self._marks, self._rolled, self._due = marks, rolled, following
-            self._last_incident_event = newest
+            self._last_incident_event, self._suppression_changes = newest, suppressions
             self._last_event = max((self._last_event, *numbers))
             return numbers
 
@@ -644,7 +648,8 @@ def _stored_before(connection: sa.Connection, key: int) -> bool:
 
 def _forget_feeder(connection: sa.Connection, name: str) -> None:
     connection.execute(FEEDER.delete().where(FEEDER.c.name == name))
-    for table in _KEPT.values():
+    # The order of signed readings stays: a feeder that is put again must not accept a repetition.
+    for table in (COMMISSION, DISTRUST):
         connection.execute(table.delete().where(table.c.feeder == name))
 
 

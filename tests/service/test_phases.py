@@ -18,7 +18,8 @@ from service.api.models import FeederDetail, State
 from service.cli.simulate import Pace, payload_of, play
 from service.engine.feeder_monitor import known_of
 from service.engine.replay import ReplayCounts, replay
-from service.ingest.reading import BadReason, Reading, Wire
+from service.ingest.decode import Wire
+from service.ingest.reading import BadReason, Reading
 from service.report.feeder_info import detail
 from service.report.report import snapshot
 from tests.service.running import service, until

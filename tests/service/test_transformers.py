@@ -18,7 +18,8 @@ from service.alarms.conditions import conditions
 from service.alarms.state_machine import AlarmKind
 from service.api.models import FeederDetail, State
 from service.engine.feeder_monitor import known_of
-from service.ingest.reading import BadReading, Wire
+from service.ingest.decode import Wire
+from service.ingest.reading import BadReading
 from service.report.feeder_info import detail
 from service.report.report import FeederReport
 from service.report.report import to_json as report_json

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from service.ingest.align import Tick
-from service.ingest.reading import BadReading, DecodedPayload, Known, Reading
+from service.ingest.decode import DecodedPayload
+from service.ingest.reading import BadReading, Known, Reading
 
 _NONE = (math.nan,) * 5
 

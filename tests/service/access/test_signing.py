@@ -14,7 +14,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from gridsec.errors import InputInvalid
 from service.access import signing
 from service.access.signing import read_meter_keys, signed_bytes
-from service.ingest.reading import Known, Wire
+from service.ingest.decode import Wire
+from service.ingest.reading import Known
 from service.settings import SettingsInvalid, settings
 from tests.codes import refused
 from tests.service.ticks import listed

@@ -198,6 +198,19 @@ def test_undecided_for_want_of_readings_is_told_unless_data_loss_tells_all_of_it
     assert (undecided.known, undecided.unheard) == (not covered, True)
 
 
+# --------------------------------------------------------------------- clocks
+
+
+def test_clocks_of_meters_and_of_the_busbar_meter() -> None:
+    now = report(meter("m1", clock_offset_s=1.5), meter("m2", clock_offset_s=-2.0), meter("m3"))
+    found = conditions(replace(now, busbar=replace(now.busbar, clock_offset_s=3.0)))
+    assert [(one.subject, one.kind, one.severity) for one in found] == [
+        (name, AlarmKind.CLOCK_OFFSET, Severity.MINOR) for name in ("m1", "m2", BUSBAR)
+    ]
+    assert ["ahead of" in one.reason for one in found] == [True, False, True]
+    assert ["come later" in one.reason for one in found] == [False, True, False]
+
+
 # ------------------------------------------------------------------- learning
 
 SILENT, NO_BUSBAR = LearningReason.SILENT, LearningReason.NO_BUSBAR
@@ -215,8 +228,19 @@ def test_stalled_meters_are_one_condition_of_the_feeder() -> None:
     assert found.severity is Severity.MINOR
     assert found.evidence == AlarmEvidence(learning=STALLED)
     assert found.reason == (
-        "2 of 3 meters are not learned after twice the expected time of 86401 s: no-busbar (1), silent (1)"
+        "2 of 3 meters are not learned after twice the expected time of 86401 s: m2, m3; "
+        "lost time: no-busbar (1), silent (1)"
     )
+
+
+def test_at_most_five_stalled_meters_have_their_names() -> None:
+    names = [f"m{k}" for k in range(8)]
+    now = report(*(meter(name, customer=f"Load {name}") for name in names))
+    stalled = tuple(StalledMeter(name, SILENT, 30.0) for name in names[:7])
+    learning = LearningReport(("stalled",) * 8, (SILENT,) * 8, 61.0, stalled)
+    (found,) = conditions(with_learning(now, learning))
+    assert ": m0 · Load m0, m1 · Load m1, " in found.reason
+    assert ", m4 · Load m4 and 2 more; " in found.reason
 
 
 def test_a_stalled_meter_without_lost_time_has_words_for_it() -> None:

@@ -18,6 +18,8 @@ from service.alarms.incidents import (
     Incident,
     IncidentBook,
     IncidentChange,
+    IncidentChanged,
+    IncidentEvent,
     IncidentKind,
     IncidentState,
     IncidentTransition,
@@ -30,6 +32,7 @@ from service.alarms.incidents import (
     advance,
     cause_of,
     due,
+    event_json,
     incident_json,
     incident_of,
 )
@@ -330,6 +333,16 @@ def test_assignment_and_comments() -> None:
     assert only(book).assigned_to is None
     with refused(IncidentUnknown, "unknown-incident"):
         act(book, Comment("village", "X" * 26, "Bob", ""))
+
+
+def test_an_event_as_json_and_an_answer_to_an_earlier_state() -> None:
+    _, (opened,) = run(raised(alarm(1)))
+    event = IncidentEvent(7, T0, opened.change, None, None, True, opened.incident)
+    shown = event_json(event)
+    assert (shown["seq"], shown["change"], shown["notify"]) == (7, "opened", True)
+    assert incident_of(shown["incident"]) == opened.incident
+    error = IncidentChanged(opened.incident, 3)
+    assert (error.code, error.incident) == ("incident-changed", opened.incident)
 
 
 # ------------------------------------------------------------ silence of a feeder

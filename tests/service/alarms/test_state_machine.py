@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gridsec.errors import InputInvalid
+from gridsec.estimators.data_errors import DataErrorKind
 from gridsec.interface import Cause
 from service.alarms.state_machine import (
     Alarm,
@@ -26,14 +27,22 @@ from service.alarms.state_machine import (
     AlreadyAcknowledged,
     Change,
     Condition,
+    NotAcknowledged,
+    RaisedAgain,
     Severity,
     acknowledged,
     advance,
+    carried,
+    carry,
+    close,
     conditions,
     from_json,
+    hold,
     restore,
     to_json,
+    unacknowledged,
 )
+from service.report.data_errors import DataErrorReport
 from service.report.report import ExplanationReport
 from tests.codes import refused
 from tests.service.reports import FEEDER, T0, acknowledge, inverter, meter, report, with_inverters
@@ -367,9 +376,8 @@ def test_the_second_operator_is_told_who_was_first() -> None:
 
 def test_an_unknown_alarm_cannot_be_acknowledged() -> None:
     book, alarm = raised()
-    with refused(AlarmUnknown, "unknown-alarm") as caught:
+    with refused(AlarmUnknown, "unknown-alarm"):
         acknowledge(book, "nothing", "Ada", "", T0)
-    assert caught.value.alarm_id == "nothing"
     pending, _ = run(at_1_hz("P"))
     with pytest.raises(AlarmUnknown):
         acknowledge(pending, alarm.id, "Ada", "", T0)
@@ -392,6 +400,98 @@ def test_a_cleared_alarm_can_still_be_answered_and_stays_cleared() -> None:
     assert (item.alarm.state, item.alarm.acknowledged_by) == (AlarmState.CLEARED, "Ada")
     with pytest.raises(AlreadyAcknowledged):
         acknowledged(book.alarms[0], "Grace", "", T0 + 31)
+
+
+def test_an_answer_to_an_earlier_occurrence_is_refused() -> None:
+    _, alarm = raised()
+    later = replace(alarm, count=3)
+    with refused(RaisedAgain, "raised-again") as caught:
+        acknowledged(later, "Ada", "", T0, count=1)
+    assert caught.value.alarm is later
+    assert acknowledged(later, "Ada", "", T0, count=3).alarm.acknowledged_by == "Ada"
+
+
+@pytest.mark.parametrize("ended", [False, True])
+def test_an_acknowledgement_is_withdrawn_once(ended: bool) -> None:
+    book, alarm = raised()
+    book, answered = acknowledge(book, alarm.id, "Ada", "seen", T0 + 10)
+    if ended:
+        book, (answered, *_) = run([(T0 + 20 + k, "A") for k in range(6)], book=book)
+    withdrawn = unacknowledged(answered.alarm, "Grace", "not yet", T0 + 30)
+    assert (withdrawn.change, withdrawn.who, withdrawn.comment) == (
+        Change.UNACKNOWLEDGED, "Grace", "not yet",
+    )  # fmt: skip
+    state = AlarmState.CLEARED if ended else AlarmState.RAISED
+    assert (withdrawn.alarm.state, withdrawn.alarm.acknowledged_by) == (state, None)
+    with refused(NotAcknowledged, "not-acknowledged") as caught:
+        unacknowledged(withdrawn.alarm, "Grace", "", T0 + 31)
+    assert caught.value.alarm is withdrawn.alarm
+
+
+def test_a_stored_answer_is_carried_to_its_occurrence_only() -> None:
+    book, alarm = raised()
+    answered = acknowledged(alarm, "Ada", "", T0 + 10).alarm
+    for other in (replace(answered, count=2), replace(answered, id="Z" * 26)):
+        assert carry(book, other) is None
+        assert carried(alarm, other) is alarm
+    after = carry(book, answered)
+    assert after is not None
+    assert after.active == (answered,)
+    withdrawn = unacknowledged(answered, "Ada", "", T0 + 11).alarm
+    assert carried(answered, withdrawn) == alarm
+    # The alarm has cleared meanwhile.
+    ended = replace(alarm, state=AlarmState.CLEARED, t_cleared=T0 + 9)
+    assert (carried(ended, answered).state, carried(ended, answered).acknowledged_by) == (
+        AlarmState.CLEARED, "Ada",
+    )  # fmt: skip
+
+
+def test_skipped_ticks_hold_every_clock() -> None:
+    book, _ = run(at_1_hz("P"))
+    held = hold(book, T0 + 1)
+    assert times(run([(T0 + 9, "P")], book=book)[1]) == [(9.0, Change.RAISED)]
+    assert run([(T0 + 9, "P")], book=held)[1] == []
+    (item,) = run([(T0 + 9, "P"), (T0 + 10, "P")], book=held)[1]
+    assert times([item]) == [(10.0, Change.RAISED)]
+
+
+def test_an_error_of_the_files_updates_the_evidence_when_it_is_new() -> None:
+    """Also another kind, other customers or another proposal; the same error, or none, changes nothing."""
+    first = DataErrorReport(DataErrorKind.PHASE, ("m1",), ("Miller", "Smith"), ("phase b",), "study", "text")
+    steps = [
+        (None, False),
+        (first, True),
+        (replace(first, text="other words", customers=("Smith", "Miller")), False),
+        (None, False),
+        (replace(first, proposed=("phase c",)), True),
+        (replace(first, kind=DataErrorKind.BUS), True),
+        (replace(first, kind=DataErrorKind.BUS, customers=("Miller",)), True),
+    ]
+    book, alarm = raised()
+    for k, (error, updates) in enumerate(steps):
+        (condition,) = tick("P")
+        now = replace(condition, evidence=AlarmEvidence(data_error=error), reason=f"why {k}")
+        book, happened = advance(book, RULES, [now], T0 + 10 + k)
+        assert [item.change for item in happened] == [Change.UPDATED] * updates, k
+        (standing,) = book.active
+        assert (standing.id, standing.count, standing.t_raised) == (alarm.id, 1, alarm.t_raised)
+        assert (standing.reason == f"why {k}") == updates
+
+
+def test_alarms_without_a_monitor_are_closed() -> None:
+    _, alarm = raised()
+    ended = replace(alarm, id="Z" * 26, state=AlarmState.CLEARED, t_cleared=T0)
+    (item,) = close([alarm, ended], T0 + 9, "removed")
+    assert (item.alarm.id, item.change, item.comment) == (alarm.id, Change.CLEARED, "removed")
+    assert (item.alarm.state, item.alarm.t_cleared) == (AlarmState.CLEARED, T0 + 9)
+
+
+def test_another_feeder_has_no_place_in_a_book() -> None:
+    _, alarm = raised()
+    with refused(InputInvalid, "other-feeder"):
+        restore("elsewhere", [alarm])
+    with refused(InputInvalid, "other-feeder"):
+        advance(AlarmBook("elsewhere"), RULES, tick("P"), T0)
 
 
 def test_restore_takes_the_latest_of_a_kind() -> None:

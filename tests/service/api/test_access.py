@@ -14,13 +14,31 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from service.access.audit import broken
-from service.access.identity import POLICY, PUBLIC, WHOLE_FLEET, Role
+from service.access.identity import (
+    POLICY,
+    PUBLIC,
+    WHOLE_FLEET,
+    Identity,
+    NotAuthenticated,
+    Role,
+    TooManyFailures,
+)
 from service.access.keys import create
-from service.api.access import COOKIE, FAILURES, FRESH_S
+from service.api.access import (
+    COOKIE,
+    COUNTED_S,
+    FAILURES,
+    FRESH_S,
+    LOGGED,
+    REFUSALS,
+    Authenticator,
+    subnet_of,
+)
 from service.api.routes import create_api
 from service.cli.main import app
 from service.settings import SettingsInvalid, is_loopback, settings
 from service.store.access import SESSION_S, AccessStore
+from service.store.schema import StoreUnavailable
 from tests.codes import refused
 from tests.service.asking import is_problem
 from tests.service.running import FEEDER, InProcess, service
@@ -245,6 +263,80 @@ def test_every_change_is_in_the_audit_log_before_it_is_made(
     assert all(text.split("_", 2)[2] not in texts for text in keys.values())
     page = running.http.get("/api/v1/audit", params={"limit": 1000}, headers=bearer(keys["admin"])).json()
     assert [entry["hash"] for entry in page["entries"]][-2:] == [acknowledged.hash, refused_.hash]
+
+
+def test_refused_changes_cannot_flood_the_audit_log(
+    running: InProcess, keys: dict[str, str], folder: Path
+) -> None:
+    """One identity has its own limit; changes that are permitted are all in the log."""
+    text = key(folder, Role.VIEWER, feeders=frozenset({FEEDER, OTHER}))
+    path, name = f"/api/v1/alarms/{ALARM}/ack", f"viewer of {sorted((FEEDER, OTHER))}"
+    for credential in (text, keys["operator"]):
+        for _ in range(2 * REFUSALS):
+            running.http.post(path, json={}, headers=bearer(credential))
+    with AccessStore(f"sqlite:///{folder / 'gridsec.db'}") as store:
+        entries = store.audit()
+    assert len([entry for entry in entries if entry.identity == name]) == REFUSALS
+    assert len([entry for entry in entries[-3 * REFUSALS :] if entry.target == path]) == 3 * REFUSALS
+
+
+def test_the_number_of_refusals_without_an_entry_is_in_the_chain(tmp_path: Path) -> None:
+    now = [1_000.0]
+    ada, bob = (Identity(name, Role.VIEWER, None, f"key {name}") for name in ("Ada", "Bob"))
+    with AccessStore(f"sqlite:///{tmp_path / 'gridsec.db'}") as store:
+        gate = Authenticator(store, wall=lambda: now[0])
+        for _ in range(REFUSALS + 7):
+            gate.record_refusal(ada, "PUT /x", "/x", "")
+        gate.record_refusal(bob, "PUT /x", "/x", "")
+        gate.record(bob, "log in", "::1")
+        assert len(store.audit()) == REFUSALS + 2
+        now[0] += COUNTED_S
+        gate.record(bob, "log in", "::1")
+        further, last = store.audit()[-2:]
+        assert (further.identity, further.credential, further.action) == (
+            "Ada",
+            "key Ada",
+            "refused: further",
+        )
+        assert further.detail.split()[0] == "7"
+        assert last.action == "log in"
+        # The end of the service ends every count; a database that is away keeps it.
+        gate.record_refusal(ada, "PUT /x", "/x", "")
+        database = tmp_path / "gridsec.db.access"
+        database.rename(tmp_path / "away")
+        now[0] += COUNTED_S
+        with pytest.raises(StoreUnavailable):
+            gate.record(bob, "log in", "::1")
+        (tmp_path / "away").rename(database)
+        gate.close()
+        assert [entry.detail.split()[0] for entry in store.audit()[REFUSALS + 4 :]] == ["1"]
+        assert broken(store.audit()) is None
+
+
+def test_failures_are_limited_by_subnet_and_counted(tmp_path: Path) -> None:
+    with AccessStore(f"sqlite:///{tmp_path / 'gridsec.db'}") as store:
+        gate = Authenticator(store)
+        refused_: list[type[Exception]] = []
+        for k in range(LOGGED + 5):
+            with pytest.raises((NotAuthenticated, TooManyFailures)) as caught:
+                gate.of_credential("gridsec_x", f"2001:db8:0:1::{k:x}")
+            refused_.append(caught.type)
+        assert refused_ == [NotAuthenticated] * FAILURES + [TooManyFailures] * (LOGGED + 5 - FAILURES)
+        with pytest.raises(NotAuthenticated):
+            gate.of_credential("gridsec_x", "2001:db8:0:2::1")
+        gate.close()
+        entries = store.audit()
+    assert [entry.target for entry in entries[:2]] == ["2001:db8:0:1::0", "2001:db8:0:1::1"]
+    assert len(entries) == FAILURES + 2
+    assert entries[-1].detail.split()[0] == str(LOGGED + 5 - FAILURES)
+
+
+def test_subnets() -> None:
+    assert subnet_of("2001:db8::ffff:1") == subnet_of("2001:db8::1%eth0") == "2001:db8::/64"
+    assert subnet_of("2001:db8:0:1::1") != subnet_of("2001:db8::1")
+    assert subnet_of("::ffff:192.0.2.1") == subnet_of("192.0.2.1") == "192.0.2.1"
+    assert subnet_of("192.0.2.2") != subnet_of("192.0.2.1")
+    assert subnet_of("unknown") == "unknown"
 
 
 @pytest.mark.parametrize("path", [f"/api/v1/feeders/{FEEDER}/stream", "/api/v1/alarms/stream"])

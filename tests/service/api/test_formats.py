@@ -16,8 +16,10 @@ import pytest
 
 from feeders.format.tables import to_json
 from feeders.model.site import load
+from service.alarms.conditions import AlarmKind, Severity
+from service.alarms.incidents import Incident, IncidentKind, IncidentState
 from service.api.description import feeder_schemas
-from service.api.tables import ARROW, CSV, JSON, MEDIA, PARQUET, preferred
+from service.api.tables import ARROW, CSV, JSON, MEDIA, PARQUET, encoded, incidents, preferred
 from tests.service.asking import T0, Setup, is_problem
 
 HISTORY = "/feeders/village/history"
@@ -52,6 +54,38 @@ def test_history_as_a_table(setup: Setup, media: str) -> None:
     assert (datetime.fromisoformat(shown) if media == CSV else shown) == instant
     if media == CSV:
         assert shown == "2026-11-20T22:00:30.000Z"
+
+
+@pytest.mark.parametrize("media", MEDIA[1:])
+@pytest.mark.parametrize("start", ["=", "+", "-", "@", "\t", "\r"])
+def test_texts_of_operators_are_no_formulas_in_csv(media: str, start: str) -> None:
+    text = f"{start}HYPERLINK(1)"
+    incident = Incident(
+        "0" * 26,
+        IncidentKind.MANIPULATION,
+        "village",
+        Severity.CRITICAL,
+        IncidentState.RAISED,
+        count=1,
+        alarms=1,
+        active=1,
+        unacknowledged=1,
+        kinds=(AlarmKind.METER_MANIPULATED,),
+        customers=(),
+        t_first=-1.5,
+        t_last=2.0,
+        t_cleared=None,
+        reason=f"x{start}",
+        meters=(text, text),
+        assigned_to=text,
+    )
+    content = encoded(incidents([incident]), media)
+    (row,) = table(httpx.Response(200, headers={"Content-Type": media}, content=content))
+    if media == CSV:
+        assert (row["assigned_to"], row["meters"]) == (f"'{text}", f"'{text};{text}")
+        assert (row["t_first"], row["reason"]) == ("-1.5", f"x{start}")
+    else:
+        assert (row["assigned_to"], row["meters"], row["t_first"]) == (text, [text, text], -1.5)
 
 
 @pytest.mark.parametrize("media", MEDIA[1:])

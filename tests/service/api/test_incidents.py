@@ -207,14 +207,25 @@ def test_a_shelf_of_each_kind(attacked: Setup) -> None:
     assert changes(attacked, name)[1:] == [("shelved", "Ada", "known", False)]
     done(post(attacked, "/shelves", incident=name, **wanted))
     done(post(attacked, "/shelves", feeder="village", meter="H2", **wanted))
+    assert_tag_follows(attacked, "/shelves", feeder="town", kind="undecided", **wanted)
+    (town,) = attacked.get("/shelves", params={"feeder": "town"}).json()["shelves"]
+    assert_tag_follows(attacked, f"/shelves/{town['id']}/end")
     found = attacked.get("/shelves").json()
     assert (len(found["shelves"]), found["max_duration_s"]) == (4, 86400.0)
     for each in found["shelves"]:
         assert done(post(attacked, f"/shelves/{each['id']}/end", comment="back"))["ended_by"] == "Ada"
         is_problem(post(attacked, f"/shelves/{each['id']}/end"), 404)
     assert attacked.get("/shelves").json()["shelves"] == []
-    assert len(attacked.get("/shelves", params={"standing": False}).json()["shelves"]) == 4
+    assert len(attacked.get("/shelves", params={"standing": False}).json()["shelves"]) == 5
     assert changes(attacked, name)[-1] == ("unshelved", "Ada", "back", True)
+
+
+def assert_tag_follows(setup: Setup, path: str, **body: Any) -> None:
+    """A change of a shelf or a planned work changes the ETag of the alarms; without one it stays."""
+    known = {"If-None-Match": setup.get("/alarms").headers["etag"]}
+    assert setup.get("/alarms", headers=known).status_code == 304
+    done(post(setup, path, **body))
+    assert setup.get("/alarms", headers=known).status_code == 200
 
 
 WRONG_SHELVES: list[tuple[dict[str, Any], int]] = [
@@ -234,7 +245,8 @@ WRONG_SHELVES: list[tuple[dict[str, Any], int]] = [
 
 def test_planned_work_marks_alarms_and_ends(setup: Setup) -> None:
     setup.service.wall = lambda: T0 - 5
-    work = done(post(setup, "/planned-work", feeder="village", t_until=T0 + 600, reason="cable"))
+    assert_tag_follows(setup, "/planned-work", feeder="village", t_until=T0 + 600, reason="cable")
+    (work,) = setup.get("/planned-work").json()["planned_work"]
     assert (work["t_from"], work["begun"], work["t_ended"]) == (T0 - 5, True, None)
     setup.attack(lies=LIES)
     found = incident(setup)
@@ -243,7 +255,7 @@ def test_planned_work_marks_alarms_and_ends(setup: Setup) -> None:
     assert {one["planned_work"] for one in setup.get("/alarms").json()["alarms"]} == {work["id"]}
     assert incident(setup, planned=True)["id"] == found["id"]
     assert [each["id"] for each in setup.get("/planned-work").json()["planned_work"]] == [work["id"]]
-    done(post(setup, f"/planned-work/{work['id']}/end", comment="done early"))
+    assert_tag_follows(setup, f"/planned-work/{work['id']}/end", comment="done early")
     assert changes(setup, found["id"])[-1] == ("work-ended", "Ada", "done early", True)
     assert setup.get("/planned-work").json()["planned_work"] == []
     is_problem(post(setup, f"/planned-work/{work['id']}/end"), 404)

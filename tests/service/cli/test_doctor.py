@@ -19,6 +19,7 @@ from service.cli import doctor
 from service.cli.doctor import Finding, Level
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import session
+from service.notify.webhook import new_secret
 from service.store import Store
 from service.store.backup import NEWEST
 from tests.service.commands import command
@@ -156,6 +157,55 @@ def test_feeders_of_the_database_are_checked(tmp_path: Path, monkeypatch: Patch,
     assert bad[1].startswith(f"{FEEDER}: ")
     code, out, _ = run(monkeypatch, capsys, *arguments, "--feeder", FEEDER)
     assert [level for level, _ in result(out)["feeder"]] == ["ok", "ok"]
+
+
+TARGETS = """
+[[webhook]]
+name = "public"
+url = "https://192.0.32.8/hook"
+secret_file = "{key}"
+[[webhook]]
+name = "inside"
+url = "https://127.0.0.1:{port}/hook"
+secret = "{secret}"
+[[webhook]]
+name = "no-authority"
+url = "https://192.0.32.8/hook"
+secret = "{secret}"
+ca_file = "{key}"
+[[webhook]]
+name = "unknown"
+url = "https://{label}.example/hook"
+secret = "{secret}"
+[[alertmanager]]
+name = "room"
+url = "http://127.0.0.1:{port}"
+private_addresses = true
+"""
+
+
+def test_targets_of_notifications_are_checked_and_get_nothing(tmp_path: Path) -> None:
+    assert list(doctor._notifications(None)) == []
+    secret, key, file = new_secret(), tmp_path / "key", tmp_path / "targets.toml"
+    key.write_text(secret)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        # A label of more than 63 characters is refused without a question to a server of names.
+        file.write_text(TARGETS.format(key=key, secret=secret, port=port, label=64 * "x"))
+        found = list(doctor._notifications(file))
+        server.settimeout(0.1)
+        with pytest.raises(TimeoutError):
+            server.accept()
+    assert [each.level for each in found] == [Level.OK, Level.FAIL, Level.FAIL, Level.NOTE, Level.OK]
+    assert all(each.part == "notify" for each in found)
+    assert all(secret not in each.text for each in found)
+    assert "private_addresses" in found[1].text
+    key.unlink()
+    file.write_text(file.read_text().replace("http://127", "ftp://127"))
+    wrong = list(doctor._notifications(file))
+    assert len(wrong) == 3
+    assert {each.level for each in wrong} == {Level.FAIL}
+    assert [each.level for each in doctor._notifications(tmp_path)] == [Level.FAIL]
 
 
 def test_descriptors_against_the_meters(monkeypatch: Patch) -> None:

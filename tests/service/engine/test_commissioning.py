@@ -440,9 +440,8 @@ def test_a_stalled_meter_raises_an_alarm_that_ends_when_the_meter_is_learned(
         assert (alarm.state, alarm.severity, alarm.meter) == (AlarmState.RAISED, Severity.MINOR, None)
         begun = store.commission_events(FEEDER)[0].t
         assert (alarm.t_event, alarm.t_raised) == (begun + 122.0, begun + 124.0)
-        assert alarm.reason == (
-            "1 of 13 meters are not learned after twice the expected time of 61 s: silent (1)"
-        )
+        assert late in alarm.reason
+        assert alarm.reason.endswith("lost time: silent (1)")
         assert alarm.evidence.learning == (StalledMeter(late, "silent", 0.0),)
         report = live.monitors[FEEDER].report
         assert report is not None

@@ -17,8 +17,8 @@ from service.engine.engine import BAD_PER_ROUND, BAD_PER_SOURCE, Engine, Runtime
 from service.engine.feeder_monitor import Phase, design
 from service.engine.runtime import Runtime
 from service.ingest.align import Clock
+from service.ingest.decode import DecodedPayload, Wire
 from service.ingest.queues import Sample
-from service.ingest.reading import DecodedPayload, Wire
 from service.report.report import FeederReport
 from service.store import Store
 from tests.service.liars import FEEDER, START, rounds, until
@@ -38,7 +38,7 @@ def test_a_write_that_fails_in_an_unforeseen_way_is_shown_and_tried_again(
         with monkeypatch.context() as patch:
             patch.setattr(store, "commit", broken)
             live.cycle(until(attacked, 15.0)[0])
-            assert "a defect" in live.committer.problems()[0]
+            assert "(defect)" in live.committer.problems()[0]
             assert "2 changes of alarms wait" in live.committer.problems()[1]
         live.cycle([])
         assert live.committer.problems() == []
@@ -58,7 +58,7 @@ def test_a_write_without_an_outcome_is_a_failed_one(
         with monkeypatch.context() as patch:
             patch.setattr("service.store.committer._write", broken)
             task = asyncio.create_task(runtime.run())
-            while not any("a defect" in problem for problem in runtime.ready()[1]):  # noqa: ASYNC110
+            while not any("(defect)" in problem for problem in runtime.ready()[1]):  # noqa: ASYNC110
                 await asyncio.sleep(0.02)
         while not runtime.ready()[0]:  # noqa: ASYNC110 - readiness is what is tested
             await asyncio.sleep(0.02)

@@ -258,7 +258,7 @@ def test_an_outbox_of_any_length_is_published_in_order_also_after_a_failed_read(
             live = rounds(store, site, outlet)
             live.cycle([])
             assert outlet.events == []
-            assert "reading" in live.committer.problems()[0]
+            assert "(database-unavailable)" in live.committer.problems()[0]
         # What is stored meanwhile is published after what has been waiting.
         live.cycle(until(attacked, 15.0)[1])
         for _ in range(20):

@@ -16,11 +16,13 @@ from service.access.signing import read_meter_keys, signed_bytes
 from service.alarms.conditions import Severity, identity_mismatches
 from service.alarms.incidents import IncidentKind, IncidentState
 from service.alarms.state_machine import AlarmKind
-from service.engine.engine import Engine, RuntimeConfig
+from service.engine.engine import ORDER_S, Engine, RuntimeConfig
 from service.engine.feeder_monitor import MISMATCH_S, design
 from service.ingest.align import Clock
 from service.ingest.queues import Sample
 from service.store import Store
+from service.store.state_codec import KeptInvalid, SnapshotKind, StateSnapshot, decode_signed
+from tests.codes import refused
 
 FEEDER, START = "simbench-lv-rural1", 1_795_212_000.0
 SECRETS = {meter: bytes([k]) * 32 for k, meter in enumerate(("substation", "m01", "m02"))}
@@ -35,10 +37,10 @@ def site() -> Site:
 class Signed:
     """A feeder at no load; three of its meters sign their readings, the others need no signature."""
 
-    def __init__(self, site: Site, store: Store, keys: Path) -> None:
+    def __init__(self, site: Site, store: Store, keys: Path, second: int = 0) -> None:
         rows = [f"{FEEDER},{meter},hmac,{base64.b64encode(each).decode()}" for meter, each in SECRETS.items()]
         keys.write_text("\n".join(("feeder,meter,scheme,key", *rows)))
-        self.site, self.store, self.second, self.wall = site, store, 0, START - 0.5
+        self.site, self.store, self.second, self.wall = site, store, second, START + second - 0.5
         config = RuntimeConfig(clock=Clock.WALL, meter_keys=read_meter_keys(keys, accepts_unlisted=True))
         self.engine = Engine(config, store, [site], wall=lambda: self.wall, stored=lambda: None)
         self.engine.monitors[FEEDER].install(design(site))
@@ -143,6 +145,80 @@ def test_a_replayed_or_malformed_reading_is_no_mismatch(signed: Signed) -> None:
     signed.run(5)
     assert signed.standing() == set()
     assert {each.reason.partition(":")[0] for each in signed.store.rejected()} == {"replayed", "empty"}
+
+
+def reasons(signed: Signed) -> list[str]:
+    return [each.reason.partition(":")[0] for each in signed.store.rejected()]
+
+
+def test_a_reading_of_before_a_restart_is_refused_after_it(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after `kill -9`: the first process stores nothing at its end."""
+    monkeypatch.setattr("service.engine.engine.ORDER_S", 0.0)
+    keys, url = tmp_path / "keys.csv", f"sqlite:///{tmp_path}/g.db"
+    with Store(url) as store:
+        first = Signed(site, store, keys)
+        first.run(5)
+        old = [sample for sample in first.readings(4) if sample.attachment]
+        kept = store.signed(FEEDER)
+        assert kept is not None
+        assert {each.meter for each in decode_signed(FEEDER, kept)} == SECRETS.keys()
+    with Store(url) as store:
+        again = Signed(site, store, keys, 5)
+        again.engine.cycle(old)
+        again.run(3)
+        assert reasons(again) == ["replayed"] * len(SECRETS)
+        # A new key of a meter, which counts from the beginning, is another order.
+        rows = keys.read_text().replace(base64.b64encode(SECRETS["m01"]).decode(), "bmV3IHNlY3JldCBvZiBtMDE=")
+        keys.write_text(rows)
+        renewed = read_meter_keys(keys, accepts_unlisted=True)
+        renewed.restore(FEEDER, decode_signed(FEEDER, kept))
+        assert {each.meter for each in renewed.orders(FEEDER)} == SECRETS.keys() - {"m01"}
+
+
+def test_the_order_of_signed_readings_is_written_every_two_seconds_and_at_the_end(
+    signed: Signed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [1000.0]
+    monkeypatch.setattr("service.engine.engine.time.monotonic", lambda: now[0])
+
+    def newest() -> int:
+        signed.engine.committer.commit(at_once=True)
+        kept = signed.store.signed(FEEDER)
+        assert kept is not None
+        return {each.meter: each.seq for each in decode_signed(FEEDER, kept)}["m01"]
+
+    signed.run(3)
+    first = newest()
+    now[0] += ORDER_S
+    signed.run(1)
+    assert newest() == first + 3
+    signed.run(1)
+    assert newest() == first + 3
+    signed.engine.keep_states(at_once=True)
+    assert newest() == first + 4
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ("{}", "damaged"),
+        ('{"format": 9}', "newer-format"),
+        ('{"format": 1, "feeder": "x", "t": 1.0, "meters": []}', "other-feeder"),
+    ],
+)
+def test_a_stored_order_that_cannot_be_used_does_not_stop_the_service(
+    site: Site, tmp_path: Path, text: str, code: str
+) -> None:
+    kept = StateSnapshot(FEEDER, START, text, SnapshotKind.SIGNED)
+    with refused(KeptInvalid, code):
+        decode_signed(FEEDER, kept)
+    with Store(f"sqlite:///{tmp_path}/g.db") as store:
+        store.commit(kept=[kept])
+        again = Signed(site, store, tmp_path / "keys.csv")
+        again.run(3)
+        assert reasons(again) == []
 
 
 def test_conditions_of_mismatches() -> None:

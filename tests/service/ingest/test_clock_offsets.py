@@ -10,8 +10,8 @@ import pytest
 
 from feeders.model.site import load, to_frame
 from gridsec.interface import Cause
-from service.alarms.conditions import AlarmKind, Severity, conditions
-from service.alarms.state_machine import AlarmBook
+from service.alarms.conditions import AlarmKind, Condition, Severity, conditions
+from service.alarms.state_machine import AlarmBook, AlarmRules, advance, restore
 from service.engine.feeder_monitor import FeederMonitor, align_rules, design
 from service.ingest.align import FEWEST, KEPT, OFFSETS_TICKS, Aligner, Clock, ClockOffsets, Tick, rules
 from service.ingest.reading import Reading
@@ -171,6 +171,35 @@ def test_the_clock_of_the_busbar_meter_is_measured_and_shown() -> None:
     tick = tick_of(T0, (None,) * len(site.meter_ids), None, (), busbar_offset=2.0)
     assert to_frame(site, snapshot(site, tick)).busbar_offset == 2.0
     assert np.isnan(to_frame(site, snapshot(site, replace(tick, busbar_offset=None))).busbar_offset)
+
+
+def test_an_alarm_of_a_clock_is_held_after_a_restart_until_the_offset_is_measured() -> None:
+    """One clock is right after the restart, one is still off, one meter is silent: its alarm stays."""
+    site = load("cigre-lv")
+    kind, ids = AlarmKind.CLOCK_OFFSET, site.meter_ids
+    t0 = T0 - T0 % OFFSETS_TICKS
+    before = [Condition(kind, site.feeder.name, one, Severity.MINOR) for one in ids[:3]]
+    book, _ = advance(AlarmBook(site.feeder.name), AlarmRules(0.0), before, t0 - 60.0)
+    book = restore(site.feeder.name, book.active)
+    watch = FeederMonitor(site, align_rules(site, Clock.WALL), book)
+    rng, cleared = random.Random(7), dict[str | None, float]()
+    for k in range(4 * OFFSETS_TICKS):
+        now = t0 + k + rng.uniform(0.05, 0.2)
+        for one in (*ids, None):
+            if one == ids[2]:
+                continue
+            stamp = t0 + k + (2.0 if one == ids[1] else 0.0)
+            reading = Reading(site.feeder.name, one, stamp, site.tables.meta.voltage_volt, 0.0, 0.0)
+            for result in ingest(watch, reading, now):
+                cleared |= {
+                    each.alarm.meter: each.t for each in result.transitions if each.alarm.kind is kind
+                }
+    assert set(cleared) == {ids[0]}
+    assert cleared[ids[0]] >= t0 + FEWEST
+    active = {alarm.meter for alarm in watch.book.active if alarm.kind is kind}
+    assert active == {ids[1], ids[2]}
+    # Clocks that tell the time have no offset: nothing is to be measured.
+    assert played({}, clock=Clock.EVENTS)[-1].clocks_known is None
 
 
 @pytest.mark.parametrize(("offset", "cause"), [(1.5, Cause.AGREEMENT), (40.0, Cause.CLOCK_OFFSET)])

@@ -17,8 +17,9 @@ from hypothesis import strategies as st
 from pyarrow import ipc
 
 from service.ingest.align import Aligner, Clock, ReadingOutcome, Tick, rules
+from service.ingest.decode import Wire
 from service.ingest.queues import Sample
-from service.ingest.reading import NO_SEQ, Findings, Known, Reading, Readings, Wire, judge
+from service.ingest.reading import NO_SEQ, Findings, Known, Reading, Readings, judge
 from tests.service.ticks import listed, plain
 
 T0 = 1_795_212_000.0

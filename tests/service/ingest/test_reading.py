@@ -15,7 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyarrow import ipc
 
-from service.ingest.reading import DETAILED_PER_REASON, BadReason, Known, Reading, Wire
+from service.ingest.decode import DETAILED_PER_REASON, Wire
+from service.ingest.reading import BadReason, Known, Reading
 from tests.service.ticks import Listed, listed
 
 T = 1_795_212_000.25

@@ -357,4 +357,4 @@ def test_a_subscriber_asks_for_what_it_missed(tmp_path: Path) -> None:
             (tmp_path / "g.db").rename(tmp_path / "gone.db")
             (refusal,) = second.get("gridsec/*/alarm/*?after=0", timeout=10.0)
             assert refusal.err is not None
-            assert "cannot read" in refusal.err.payload.to_string()
+            assert "(file-removed)" in refusal.err.payload.to_string()

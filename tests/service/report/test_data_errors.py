@@ -32,7 +32,8 @@ from service.api.models import State
 from service.cli.simulate import Pace, play
 from service.engine.feeder_monitor import TickResult
 from service.engine.replay import ReplayCounts, replay
-from service.report.report import DataErrorReport, DataErrors, to_json, with_data_error
+from service.report.data_errors import DataErrorReport, DataErrors
+from service.report.report import to_json, with_data_error
 from tests.service.reports import FEEDER, T0, acknowledge, meter, report
 from tests.service.running import service, until
 

@@ -183,7 +183,14 @@ OLD_LAYOUT = sa.Table(
 
 def put_back_incidents(connection: sa.Connection) -> None:
     """Make a database one of version 5."""
-    for table in (schema.ROLLUP, schema.INCIDENT_EVENT, schema.INCIDENT, schema.SHELF, schema.WORK):
+    for table in (
+        schema.SIGNED,
+        schema.ROLLUP,
+        schema.INCIDENT_EVENT,
+        schema.INCIDENT,
+        schema.SHELF,
+        schema.WORK,
+    ):
         table.drop(connection)
     connection.exec_driver_sql("DROP INDEX alarm_by_incident")
     for column in ("incident", "work", "words"):
@@ -216,6 +223,20 @@ def put_back(connection: sa.Connection, version: int, *later: sa.Table) -> None:
     for table in (OLD_LAYOUT, schema.HISTORY):
         table.create(connection)
     connection.execute(schema.VERSION.update().values(version=version))
+
+
+@both
+def test_a_database_from_before_signed_readings_were_kept_is_brought_forward(url: str) -> None:
+    kept = StateSnapshot("village", T0, "{}", SnapshotKind.SIGNED)
+    with Store(url) as old, old._write() as connection:
+        schema.SIGNED.drop(connection)
+        connection.execute(schema.VERSION.update().values(version=7))
+    with Store(url) as new:
+        assert new.signed("village") is None
+        new.commit(kept=[kept])
+        # A deleted feeder that is put again must not accept a repetition.
+        new.commit(without="village")
+        assert (new.signed("village"), new.distrust("village")) == (kept, None)
 
 
 @both

@@ -12,10 +12,10 @@ from gridsec.estimators.data_errors import DataErrorKind
 from gridsec.estimators.sequential import LearningReason, LearningState
 from gridsec.interface import Cause
 from service.alarms.state_machine import AlarmState, AlarmTransition, Change
+from service.report.data_errors import DataErrorReport
 from service.report.report import (
     BusbarMeterState,
     CustomerState,
-    DataErrorReport,
     InverterState,
     LearningReport,
     StalledMeter,
