@@ -22,7 +22,7 @@ export const local = (t) => {
 
 /* Open the form. `title`, `what`, `verb`: texts; `text`: name of the text field, which `needed` requires.
    `to`: text; `scope`, `duration`: [value, text] of each choice; `times`: [from, until], Unix s.
-   `send` takes the name (`who`, or nothing by the credential) and the values; the form closes when it resolves. */
+   `send` takes the name (a name, or nothing by the credential) and the values; the form closes when it resolves. */
 export function ask(action) {
   place = placeOf(document.activeElement);
   asking = { text: "Comment", ...action };

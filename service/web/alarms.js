@@ -1,7 +1,7 @@
 // Alarm list: loaded once, then updated by the event stream; actions on a single alarm, and its log.
 
 import { ask, post } from "./actions.js";
-import { byId, clock, deviceName, duration, el, getJson, isKnown, settle, signed, volt } from "./dom.js";
+import { byId, clock, deviceName, duration, el, getJson, isKnown, settle, guideLink, signed, sinceNode, volt } from "./dom.js";
 
 const API = "/api/v1/alarms";
 const KIND = {
@@ -224,8 +224,8 @@ export class Alarms {
     const subject = subjectOf(alarm);
     const where = subject ? `${subject} · ${alarm.feeder}` : alarm.feeder;
     const since = alarm.state === "cleared"
-      ? `${clock(alarm.t_raised)}, cleared after ${duration(alarm.t_cleared - alarm.t_raised)}`
-      : `since ${clock(alarm.t_raised)}`;
+      ? el("span", { class: "quiet", text: `${clock(alarm.t_raised)}, cleared after ${duration(alarm.t_cleared - alarm.t_raised)}` })
+      : sinceNode(alarm.t_raised);
     const answered = alarm.acknowledged_by
       ? el("p", { class: "answer" }, `Acknowledged by ${alarm.acknowledged_by}`, alarm.comment ? el("q", { text: alarm.comment }) : null)
       : null;
@@ -241,14 +241,15 @@ export class Alarms {
         } } })),
         el("p", { class: "numbers", text: numbers }),
         alarm.kind === "meter-manipulated" ? hint(e) : null,
-        el("p", { class: "quiet since", text: since }),
+        el("p", { class: "since" }, since),
         answered,
         el("p", { class: "tools more" },
+          this.answerButton(alarm),
           alarm.meter && this.onSeries ? this.button("series", "Time series", () => this.onSeries(alarm)) : null,
           this.button("comment", "Comment", () => this.ask("comment", alarm)),
+          guideLink(alarm.kind),
           el("button", { type: "button", class: "plain", "data-do": "log", "aria-expanded": String(this.logs.has(alarm.id)), text: "Log", on: { click: () => this.toggleLog(alarm.id) } })),
-        this.log(alarm.id)),
-      this.answerButton(alarm));
+        this.log(alarm.id)));
   }
 
   // Acknowledgement of an open alarm, or its withdrawal while the alarm is active.
@@ -269,8 +270,11 @@ export class Alarms {
     const found = this.logs.get(id);
     if (found === null) return el("p", { class: "quiet", text: "Loading …" });
     if (found instanceof Error) return el("p", { class: "error", text: `Log not loaded: ${found.message}` });
-    return el("ol", { class: "log", "aria-label": "Log of the alarm" }, ...found.filter(({ change }) => change !== "updated").map(({ t, change, who, comment }) =>
-      el("li", {}, el("time", { text: clock(t) }), ` ${CHANGE[change] ?? change}${who ? ` by ${who}` : ""}`, comment ? el("q", { text: comment }) : null)));
+    return el("ol", { class: "log", "aria-label": "Log of the alarm" }, ...found.filter(({ change }) => change !== "updated").map((event) => {
+      const { t, change, comment } = event;
+      const by = event.who ? ` by ${event.who}` : "";
+      return el("li", {}, el("time", { text: clock(t) }), ` ${CHANGE[change] ?? change}${by}`, comment ? el("q", { text: comment }) : null);
+    }));
   }
 
   async toggleLog(id) {
@@ -306,9 +310,9 @@ export class Alarms {
     ask({
       ...ACTIONS[name],
       what: `${KIND[alarm.kind] ?? alarm.kind}: ${subjectOf(alarm) || alarm.feeder}. ${alarm.reason}`,
-      send: async (who, { text }) => {
+      send: async (by, { text }) => {
         const more = name === "ack" ? { count: alarm.count } : {};
-        this.put(await post(`${API}/${encodeURIComponent(alarm.id)}/${name}`, { ...who, comment: text, ...more }));
+        this.put(await post(`${API}/${encodeURIComponent(alarm.id)}/${name}`, { ...by, comment: text, ...more }));
         if (this.logs.has(alarm.id)) this.loadLog(alarm.id);
         this.onChange();
         this.render();

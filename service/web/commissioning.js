@@ -18,7 +18,7 @@ const REASON = {
 
 function hours(seconds) {
   const h = seconds / 3600;
-  return h >= 10 || Number.isInteger(h) ? String(Math.floor(h)) : h.toFixed(1);
+  return h >= 10 || h < 0.05 || Number.isInteger(h) ? String(Math.floor(h)) : h.toFixed(1);
 }
 
 const day = (t) => new Date(t * 1000).toLocaleDateString();
@@ -97,8 +97,8 @@ export class Commissioning {
       verb: "Learn anew",
       text: "Reason",
       needed: true,
-      send: async (who, { text }) => {
-        const body = await post(`${API}/${encodeURIComponent(feeder)}/commissioning`, { ...who, reason: text, meters: [meter] });
+      send: async (by, { text }) => {
+        const body = await post(`${API}/${encodeURIComponent(feeder)}/commissioning`, { ...by, reason: text, meters: [meter] });
         if (body.feeder === this.feeder) this.take(body);
       },
     });

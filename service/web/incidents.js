@@ -1,7 +1,7 @@
 // Incident list: one line per incident, expandable to its alarms and its log; actions of operators; hand-over.
 
 import { ask, post } from "./actions.js";
-import { byId, clock, duration, el, getJson, isKnown, settle } from "./dom.js";
+import { byId, clock, duration, el, getJson, guideLink, isKnown, settle, sinceNode } from "./dom.js";
 import { session } from "./session.js";
 
 const API = "/api/v1";
@@ -29,6 +29,7 @@ const ACTIONS = {
   work: { title: "Planned work", verb: "Enter", text: "Reason", needed: true },
 };
 const HOURS = [1, 4, 8, 24, 72, 168];
+const BUSBAR = "substation";
 const PAGE = 50;
 const ALARMS_SHOWN = 100;
 const METERS_LISTED = 20; // Largest number of meters in the choice of a shelf.
@@ -38,10 +39,20 @@ const SOON_MS = 200;
 const plural = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
 // Devices of an incident: one by name, several by number.
 function subject({ meters, customers }) {
-  if (meters.length > 1) return plural(meters.length, "meter");
-  if (meters.length === 1) return meters[0];
+  const own = meters.filter((meter) => meter !== BUSBAR);
+  const busbar = own.length < meters.length;
+  if (own.length) return `${own.length > 1 ? plural(own.length, "meter") : own[0]}${busbar ? " and the busbar meter" : ""}`;
+  if (busbar) return "busbar meter";
   if (customers.length) return customers.length === 1 ? customers[0] : plural(customers.length, "inverter");
   return null;
+}
+
+// Sentence on an incident: the devices of a manipulation, otherwise the reason of its severest alarm.
+function reasonOf({ kind, meters, customers, reason }) {
+  const named = [...meters, ...customers.map((customer) => `inverter of ${customer}`)];
+  if (kind !== "manipulation" || !named.length) return reason;
+  const more = named.length > METERS_LISTED ? ` and ${named.length - METERS_LISTED} more` : "";
+  return named.length === 1 ? `${named[0]} ${reason}` : `Named as manipulated: ${named.slice(0, METERS_LISTED).join(", ")}${more}.`;
 }
 
 export class Incidents {
@@ -99,13 +110,14 @@ export class Incidents {
     try {
       const page = await getJson(`${API}/incidents?${this.query()}`);
       if (turn !== this.turn) return; // The response belongs to an earlier choice.
-      byId("incident-error").hidden = true;
+      byId("incident-error").hidden = byId("incident-loading").hidden = true;
       byId("incident-count").hidden = page.raised === 0;
       byId("incident-count").textContent = `${page.raised} new`;
       byId("incident-more").hidden = page.next === null;
       await this.list(page.incidents);
     } catch (error) {
       if (turn !== this.turn) return;
+      byId("incident-loading").hidden = true;
       byId("incident-error").textContent = `Incidents not loaded: ${error.message}`;
       byId("incident-error").hidden = false;
     }
@@ -131,13 +143,14 @@ export class Incidents {
       this.open.delete(id);
     } else {
       this.open.set(id, null);
+      this.render();
       await this.details(id).catch((error) => this.open.set(id, { problem: error.message }));
     }
     this.render();
   }
 
   render() {
-    byId("incident-none").hidden = this.found.length > 0 || !byId("incident-error").hidden;
+    byId("incident-none").hidden = this.found.length > 0 || !byId("incident-error").hidden || !byId("incident-loading").hidden;
     const focused = document.activeElement?.closest?.("[data-incident]");
     const [own, act] = [focused?.dataset.incident, document.activeElement?.dataset?.act];
     // Unchanged items keep their nodes: a click must not fall between two copies of a button.
@@ -168,7 +181,7 @@ export class Incidents {
       el("b", { text: KIND[incident.kind] ?? incident.kind }),
       el("span", { class: "place", text: place }),
       el("span", { class: "numbers", text: numbers }),
-      el("span", { class: "quiet", text: `since ${clock(incident.t_first)}` }),
+      sinceNode(incident.t_first),
       note(isKnown(incident.shelved_until) && incident.state !== "cleared" ? `shelved until ${clock(incident.shelved_until)}` : "", "shelved"),
       note(isKnown(incident.planned_until) && incident.state !== "cleared" ? `planned work until ${clock(incident.planned_until)}` : "", "work"),
       note(incident.state === "acknowledged" ? `acknowledged${incident.acknowledged_by ? ` by ${incident.acknowledged_by}` : ""}` : "", "ack"),
@@ -186,15 +199,17 @@ export class Incidents {
       open && incident.unacknowledged ? button("ack", "Acknowledge all") : null,
       open && incident.active > incident.unacknowledged ? button("unack", "Withdraw") : null,
       button("comment", "Comment"), button("assign", "Assign"),
-      open ? button("shelve", "Shelve") : null);
+      open ? button("shelve", "Shelve") : null,
+      guideLink(incident.kind));
     const events = (found?.events ?? []).filter((event) => event.change !== "updated");
     return el("div", { class: "body" },
-      el("p", { class: "reason", text: incident.reason }),
+      el("p", { class: "reason", text: reasonOf(incident) }),
       el("p", {}, el("a", { href: `#${encodeURIComponent(incident.feeder)}`, class: "where", text: `Show ${incident.feeder}`, on: { click: (event) => {
         event.preventDefault();
         this.onPick(incident.feeder, incident.meters[0] ?? null, incident.customers[0] ?? null);
       } } })),
       buttons,
+      found === null ? el("p", { class: "quiet", text: "Loading …" }) : null,
       found?.problem ? el("p", { class: "error", text: `Not loaded: ${found.problem}` }) : null,
       el("ol", { class: "alarm-list", "aria-label": "Alarms of the incident" }, ...(found?.alarms ?? []).map((alarm) => this.alarms.item(alarm))),
       found?.more ? el("p", { class: "quiet", text: `${incident.alarms - ALARMS_SHOWN} more alarms` }) : null,
@@ -244,9 +259,9 @@ export class Incidents {
       scope: name === "shelve" ? scopes(incident) : undefined,
       duration: name === "shelve" ? await this.durations() : undefined,
       times: name === "work" ? [now, now + 7200] : undefined,
-      send: async (who, values) => {
+      send: async (by, values) => {
         const [url, body] = request(name, incident ?? { feeder }, values);
-        await post(url, { ...who, ...body });
+        await post(url, { ...by, ...body });
         this.reload();
         if (byId("shift").open) this.shift();
       },

@@ -8,7 +8,7 @@ const BUSBAR = "substation";
 const MOST = 6; // Meters in one chart.
 const SPANS = [[3600, "1 h"], [21600, "6 h"], [86400, "24 h"], [604800, "7 d"], [1209600, "14 d"]];
 const [SHORTEST_S, LONGEST_S] = [60, 1209600];
-const [LEFT, RIGHT, LANE, ROW, GAP, AXIS] = [70, 12, 11, 9, 14, 22]; // Margins and heights, px.
+const [LEFT, RIGHT, LANE, ROW, GAP, AXIS] = [70, 12, 11, 9, 24, 22]; // Margins and heights, px.
 const ALARM_ROWS = 4;
 const TABLE_ROWS = 24; // Times in the table.
 const STEPS_S = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400, 172800, 604800];
@@ -469,7 +469,7 @@ export class Series {
         svg("path", { class: "estimated", d: line(of("estimated"), y) }),
         svg("path", { class: "reported", d: line(of("reported"), y) }),
         svg("path", { class: "named", d: named })),
-      svg("text", { class: "meter-name", x: LEFT + 7, y: top + 16, text: this.name(meter.meter) }));
+      svg("text", { class: "meter-name", x: LEFT, y: top - 6, text: this.name(meter.meter) }));
   }
 
   axis(x, { top, bottom, right }) {
