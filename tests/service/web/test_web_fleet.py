@@ -32,7 +32,8 @@ def tick(site: Site, village: Any, t: float, **changes: Any) -> None:
     site.service.tick(village.report(t, **changes))
 
 
-@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+@pytest.mark.canary("phone")
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 def test_the_worst_feeder_comes_first(
     site_of: Callable[..., Site], village: Callable[..., Any], size: dict[str, int]
 ) -> None:
