@@ -19,6 +19,7 @@ above the list (median of 5), time of a scroll step with layout (median of 20), 
 from __future__ import annotations
 
 import asyncio
+import math
 import shutil
 import statistics
 import tempfile
@@ -72,9 +73,8 @@ def _tick(feeder: str, sample: SimulatedTick) -> Tick:
         one = found.get(meter)
         if one is None:
             return None
-        q = {} if one.q_kvar is None else {"q_kvar": one.q_kvar}
-        p = {} if one.p_kw is None else {"p_kw": one.p_kw}
-        return Reading(feeder, meter or None, sample.t, one.v_volt, **p, **q)
+        p, q = (math.nan if value is None else value for value in (one.p_kw, one.q_kvar))
+        return Reading(feeder, meter or None, sample.t, one.v_volt, p, q)
 
     return tick_of(sample.t, tuple(map(reading, sample.meter_ids)), reading(""), ())
 
@@ -98,7 +98,8 @@ class Fleet:
         finished = registry.design(site)
         self.monitors: dict[str, FeederMonitor] = {}
         for k in range(count):
-            named = replace(site, feeder=replace(site.feeder, name=f"feeder-{k:04d}"))
+            name = f"feeder-{k:04d}"
+            named = replace(site, feeder=replace(site.feeder, name=name))  # type: ignore[arg-type]
             rules = align_rules(named, Clock.WALL)
             monitor = FeederMonitor(named, rules, AlarmBook(named.feeder.name))
             monitor.install(finished)

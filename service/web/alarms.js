@@ -234,7 +234,8 @@ export class Alarms {
         el("p", { class: "name" },
           el("b", { text: KIND[alarm.kind] ?? alarm.kind }),
           el("span", { class: "severity", text: alarm.severity }),
-          alarm.count > 1 ? el("span", { class: "times", title: "number of occurrences", text: `× ${alarm.count}` }) : null),
+          alarm.count > 1 ? el("span", { class: "times", title: "number of occurrences", text: `× ${alarm.count}` }) : null,
+          guideLink(alarm.kind)),
         el("p", {}, el("a", { href: `#${encodeURIComponent(alarm.feeder)}`, class: "where", text: where, on: { click: (event) => {
           event.preventDefault();
           this.onPick(alarm.feeder, alarm.meter, alarm.customer);
@@ -247,7 +248,6 @@ export class Alarms {
           this.answerButton(alarm),
           alarm.meter && this.onSeries ? this.button("series", "Time series", () => this.onSeries(alarm)) : null,
           this.button("comment", "Comment", () => this.ask("comment", alarm)),
-          guideLink(alarm.kind),
           el("button", { type: "button", class: "plain", "data-do": "log", "aria-expanded": String(this.logs.has(alarm.id)), text: "Log", on: { click: () => this.toggleLog(alarm.id) } })),
         this.log(alarm.id)));
   }

@@ -71,7 +71,8 @@ async function start() {
     return;
   }
   if (!feeders.length) {
-    byId("reason").textContent = "The service monitors no feeder yet.";
+    banner.empty("The service monitors no feeder yet.");
+    byId("next").hidden = true;
     setTimeout(start, 5000);
     return;
   }
