@@ -11,14 +11,15 @@ over a real connection, gzip included:
 - page: `GET /feeders?order=worst&limit=50`, the request of the web page;
 - ratio: of both times.
 
-With `--page` a browser (Chromium) shows them. Printed besides: time from the navigation to the first row of
-the list (median of 3), time from a stored verdict to its number above the list (median of 5), time of a
-scroll step with layout (median of 20), and the number of elements of the document.
+With `--page` a browser (Chromium) shows them. Printed besides: time from the navigation to the first
+contentful paint and to the first row of the list (medians of 3), time from a stored verdict to its number
+above the list (median of 5), time of a scroll step with layout (median of 20), and the number of elements.
 """
 
 from __future__ import annotations
 
 import asyncio
+import math
 import shutil
 import statistics
 import tempfile
@@ -46,7 +47,9 @@ from service.engine.runtime import Runtime
 from service.ingest.align import Clock, Tick
 from service.ingest.reading import Reading
 from service.report.report import FeederReport
+from service.report.tick_state import TickState
 from service.store import Store
+from tests.service.ticks import tick_of
 
 FEEDER = "simbench-lv-rural1"
 EVERY = 50  # One feeder in as many is attacked.
@@ -70,23 +73,24 @@ def _tick(feeder: str, sample: SimulatedTick) -> Tick:
         one = found.get(meter)
         if one is None:
             return None
-        q = {} if one.q_kvar is None else {"q_kvar": one.q_kvar}
-        p = {} if one.p_kw is None else {"p_kw": one.p_kw}
-        return Reading(feeder, meter or None, sample.t, one.v_volt, **p, **q)
+        p, q = (math.nan if value is None else value for value in (one.p_kw, one.q_kvar))
+        return Reading(feeder, meter or None, sample.t, one.v_volt, p, q)
 
-    return Tick(sample.t, tuple(map(reading, sample.meter_ids)), reading(""), ())
+    return tick_of(sample.t, tuple(map(reading, sample.meter_ids)), reading(""), ())
 
 
 class Fleet:
     """Backend of the HTTP application with `count` feeders; its list is made by the methods of `Runtime`."""
 
-    feeders, feeder, known, unloaded, report = (
+    feeders, feeder, known, unloaded, report, summary = (
         Runtime.feeders,
         Runtime.feeder,
         Runtime.known,
         Runtime.unloaded,
         Runtime.report,
+        Runtime.summary,
     )
+    shelve_most_s = 86_400.0
 
     def __init__(self, store: Store, count: int) -> None:
         self.store = store
@@ -94,19 +98,20 @@ class Fleet:
         finished = registry.design(site)
         self.monitors: dict[str, FeederMonitor] = {}
         for k in range(count):
-            named = replace(site, feeder=replace(site.feeder, name=f"feeder-{k:04d}"))
+            name = f"feeder-{k:04d}"
+            named = replace(site, feeder=replace(site.feeder, name=name))  # type: ignore[arg-type]
             rules = align_rules(named, Clock.WALL)
             monitor = FeederMonitor(named, rules, AlarmBook(named.feeder.name))
             monitor.install(finished)
             self.monitors[monitor.name] = monitor
         self._engine: Any = SimpleNamespace(monitors=self.monitors, unloaded={})
         self.attacked = ticks_of(site, AttackSpec(AttackKind.BIAS, 2, 4.0, onset_s=0.0))
-        clean = self._play(next(iter(self.monitors.values())), ticks_of(site, None))[-1].report
+        clean = self._play(next(iter(self.monitors.values())), ticks_of(site, None))[-1].state
         for k, name in enumerate(self.monitors):
             if k % EVERY == EVERY // 2:
                 self.attack(name)
             else:
-                self.monitors[name].report = replace(clean, feeder=name)
+                self._show(name, replace(clean, site=self.monitors[name].site))
         self.loop: asyncio.AbstractEventLoop | None = None
         self.queues: set[asyncio.Queue[dict[str, Any] | None]] = set()
 
@@ -116,19 +121,24 @@ class Fleet:
 
     def attack(self, name: str) -> None:
         """Evaluate the attacked readings for a feeder, and store its alarms."""
-        self.monitors[name].report = None
+        self._show(name, None)
         for result in self._play(self.monitors[name], self.attacked):
             self.store.commit(result.transitions, reports=[result.report])
 
     def tick(self) -> None:
         """Renew the report of every feeder."""
-        for monitor in self.monitors.values():
-            if monitor.report is not None:
-                monitor.report = replace(monitor.report, t=monitor.report.t + 1.0)
+        for name, monitor in self.monitors.items():
+            if monitor.latest is not None:
+                self._show(
+                    name, replace(monitor.latest, tick=replace(monitor.latest.tick, t=monitor.latest.t + 1.0))
+                )
 
-    def age(self, report: FeederReport) -> float:
+    def _show(self, name: str, state: TickState | None) -> None:
+        self.monitors[name].latest = state
+
+    def age(self, report: FeederReport | TickState) -> float:
         """Age of a report, s."""
-        newest = self.monitors[report.feeder].report
+        newest = self.monitors[report.feeder].latest
         return 0.0 if newest is None else newest.t - report.t
 
     def commissioning(self, name: str) -> Any:
@@ -196,15 +206,18 @@ def in_browser(url: str, fleet: Fleet) -> str:
     with sync_playwright() as playwright:
         options = ["--headless", "--no-sandbox", "--disable-gpu"]
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=options)
-        first = []
+        first, painted = [], []
         for _ in range(VIEWS):
             page = browser.new_page()
             begun = time.perf_counter()
             page.goto(url, wait_until="commit")
             page.wait_for_selector("#fleet-rows tr")
             first.append(time.perf_counter() - begun)
+            painted.append(
+                page.evaluate("performance.getEntriesByName('first-contentful-paint')[0].startTime")
+            )
         changes = []
-        clean = [name for name, one in fleet.monitors.items() if one.report and one.report.verdict == "clean"]
+        clean = [name for name, one in fleet.monitors.items() if one.latest and one.latest.verdict == "clean"]
         total = len(fleet.monitors) - len(clean)
         for name in clean[1 : CHANGES + 1]:
             fleet.attack(name)
@@ -231,6 +244,7 @@ def in_browser(url: str, fleet: Fleet) -> str:
         elements = page.evaluate("document.querySelectorAll('*').length")
         browser.close()
     return (
+        f"first paint {statistics.median(painted):.0f} ms, "
         f"first rows {1e3 * statistics.median(first):.0f} ms, change shown after "
         f"{statistics.median(changes):.1f} s (at most {max(changes):.1f} s), a scroll step {drawn:.1f} ms, "
         f"{elements} elements"

@@ -8,10 +8,12 @@ import runpy
 import sys
 from pathlib import Path
 
+import httpx
 import pytest
 
-from benchmarks import traces
+from benchmarks import overview, traces
 from benchmarks._arguments import arguments
+from service.store import Store
 
 ROOT = Path(__file__).parents[1]
 MODULES = sorted(
@@ -60,6 +62,18 @@ def test_arguments_of_benchmarks_are_looked_at(monkeypatch: pytest.MonkeyPatch) 
         monkeypatch.setattr("sys.argv", ["x", *wrong])
         with pytest.raises(SystemExit):
             arguments("", **usual)
+
+
+def test_the_overview_serves_clean_and_attacked_feeders(tmp_path: Path) -> None:
+    with Store(f"sqlite:///{tmp_path / 'gridsec.db'}") as store:
+        fleet = overview.Fleet(store, overview.EVERY // 2 + 1)
+        with overview.served(fleet) as url, httpx.Client(base_url=url, timeout=20) as client:
+            found = client.get("/api/v1/feeders", params=overview.HEAD).json()
+            assert found["feeders"][0]["suspects"] == 2
+            fleet.attack("feeder-0001")
+            changed = client.get("/api/v1/feeders", params=overview.HEAD).json()
+    assert (found["counts"]["attacked"], found["counts"]["clean"]) == (1, overview.EVERY // 2)
+    assert changed["counts"]["attacked"] == 2
 
 
 def test_a_trace_counts_functions_at_run_time_and_nothing_of_an_import(

@@ -13,7 +13,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse
 
 ADDRESS: Final = "/operator-guide"
-"""Path of the page, as in `web/banner.js`."""
+"""Path of the page, as in `web/dom.js`."""
 _HERE = Path(__file__).parent
 _FILES = (_HERE.with_name("web") / "operator-guide.md", _HERE.parents[1] / "docs" / "operator-guide.md")
 """The guide of an installed package, and of a source tree."""

@@ -135,6 +135,12 @@ class FeederSummary(BaseModel):
     displayed_since: float | None = Field(
         default=None, description="First tick of the time that led to it, Unix s."
     )
+    cause: str | None = Field(
+        default=None, description="Cause of the displayed verdict; `overload` and `no-owner`: not evaluated."
+    )
+    t_measured: float | None = Field(
+        default=None, description="Newest tick with a trusted voltage reading, Unix s."
+    )
     meters: int = Field(default=0, description="Number of meters at the latest tick.")
     suspects: int = Field(default=0, description="Meters and inverters named as manipulated at that tick.")
     silent: int = Field(default=0, description="Silent meters of customers at that tick.")
@@ -149,6 +155,10 @@ class Feeders(BaseModel):
     total: int = Field(description="Number of feeders that fit the filters, on this page or not.")
     counts: dict[FeederStatus, int] = Field(
         description="Number of feeders by status, whatever the filters are."
+    )
+    causes: dict[str, int] = Field(
+        default_factory=dict,
+        description="Number of feeders that are not evaluated by cause; they are undecided in `counts`.",
     )
 
 

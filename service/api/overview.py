@@ -6,13 +6,14 @@ in its list, its selector and the title of its tab.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
 from service.api import models
-from service.report.feeder_info import FeederStatus, status_of
+from service.report.feeder_info import UNWATCHED, FeederStatus, status_of
 from service.store import AlarmCounts
 
 _RANK = {status: k for k, status in enumerate(FeederStatus)}
@@ -87,6 +88,7 @@ def page(
     counts = dict.fromkeys(FeederStatus, 0)
     for one in found:
         counts[one.status] += 1
+    causes = Counter(str(one.now["cause"]) for one in found if one.now.get("cause") in UNWATCHED)
     return models.Feeders(
-        feeders=[one.summary() for one in (*shown, *beside)], total=len(chosen), counts=counts
+        feeders=[one.summary() for one in (*shown, *beside)], total=len(chosen), counts=counts, causes=causes
     )

@@ -23,6 +23,10 @@ class FeederStatus(StrEnum):
     CLEAN = "clean"
 
 
+UNWATCHED = frozenset({"overload", "no-owner"})
+"""Causes of feeders without an evaluation of their readings: undecided, and not a lack of data."""
+
+
 def status_of(now: Mapping[str, Any], patience_s: float | None, *, failed: bool = False) -> FeederStatus:
     """Return the status of a feeder: its displayed verdict, unless no value uses a present reading.
 
@@ -31,6 +35,8 @@ def status_of(now: Mapping[str, Any], patience_s: float | None, *, failed: bool 
     """
     if failed:
         return FeederStatus.NOT_MONITORED
+    if now.get("cause") in UNWATCHED:
+        return FeederStatus.UNDECIDED
     age_s = now.get("age_s")
     stale = age_s is not None and patience_s is not None and age_s > patience_s
     if not now or now["model_only"] or stale:
@@ -49,6 +55,8 @@ def numbers(report: FeederReport, age_s: float) -> dict[str, Any]:
         "since": report.since,
         "displayed_verdict": None if shown is None else shown.verdict,
         "displayed_since": None if shown is None else shown.since,
+        "cause": report.cause if shown is None else shown.cause,
+        "t_measured": report.t_measured,
         "meters": len(report.meters),
         "suspects": len(report.suspects) + sum(inverter.suspect for inverter in report.inverters),
         "silent": sum(one.meter != BUSBAR for one in report.silent),

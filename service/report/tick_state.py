@@ -115,6 +115,8 @@ class TickState:
             "since": self.since,
             "displayed_verdict": None if shown is None else shown[0].verdict,
             "displayed_since": None if shown is None else shown[1],
+            "cause": self.cause if shown is None else shown[0].cause,
+            "t_measured": self.t_measured,
             "meters": len(self.site.meter_ids),
             "suspects": len(self.suspects) + self.inverters,
             "silent": sum(meter is not None for meter, _ in self.tick.silent),

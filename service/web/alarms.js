@@ -1,7 +1,7 @@
-// Alarm list: loaded once, then updated by the event stream; acknowledgements are sent with a name.
+// Alarm list: loaded once, then updated by the event stream; actions on a single alarm, and its log.
 
-import { byId, clock, deviceName, duration, el, getJson, isKnown, settle, signed, volt } from "./dom.js";
-import { session } from "./session.js";
+import { ask, post } from "./actions.js";
+import { byId, clock, deviceName, duration, el, getJson, isKnown, settle, guideLink, signed, sinceNode, volt } from "./dom.js";
 
 const API = "/api/v1/alarms";
 const KIND = {
@@ -13,6 +13,16 @@ const KIND = {
   "learning-stalled": "Learning stalled",
   "clock-offset": "Clock offset",
   "identity-mismatch": "Identity mismatch",
+};
+// Actions on a single alarm: texts of the form, and the last part of the path.
+const ACTIONS = {
+  ack: { title: "Acknowledge alarm", verb: "Acknowledge" },
+  unack: { title: "Withdraw acknowledgement", verb: "Withdraw" },
+  comment: { title: "Comment on alarm", verb: "Add comment", needed: true },
+};
+const CHANGE = {
+  raised: "raised", acknowledged: "acknowledged", cleared: "cleared", updated: "evidence updated",
+  unacknowledged: "acknowledgement withdrawn", commented: "comment",
 };
 const LISTED = 5; // Largest number of meters in the text of an alarm.
 const PAGE = 50;
@@ -38,6 +48,7 @@ export class Alarms {
   constructor({ onPick, onLink, onChange = () => {} }) {
     this.alarms = new Map();
     this.items = new Map();
+    this.logs = new Map(); // Events of the alarms with an open log.
     this.loading = 0;
     this.heard = new Map(); // Newest event of each alarm during a request: the list may be older.
     this.raised = 0; // Number of active alarms without an acknowledgement, loaded or not.
@@ -46,6 +57,7 @@ export class Alarms {
     this.onPick = onPick;
     this.onLink = onLink;
     this.onChange = onChange; // Called after each change of an alarm.
+    this.onLog = () => {}; // Called after a log was opened, loaded or closed.
     this.feeder = null;
     this.source = null;
     this.retry = null;
@@ -54,8 +66,6 @@ export class Alarms {
     for (const id of ["alarm-state", "alarm-kind"]) byId(id).addEventListener("change", () => this.reload());
     byId("alarm-scope").addEventListener("change", () => this.reload());
     byId("alarm-more").addEventListener("click", () => this.reload({ more: true }));
-    byId("ack-cancel").addEventListener("click", () => byId("ack").close());
-    byId("ack-form").addEventListener("submit", (event) => this.answer(event));
   }
 
   filters() {
@@ -164,6 +174,7 @@ export class Alarms {
     const { alarm } = event;
     this.onChange();
     if (this.loading > 0) this.heard.set(alarm.id, event);
+    if (this.logs.has(alarm.id)) this.loadLog(alarm.id);
     this.put(alarm);
     this.render();
     this.soon ??= setTimeout(() => { this.soon = null; this.check(); }, SOON_MS);
@@ -190,16 +201,19 @@ export class Alarms {
     byId("alarm-count").textContent = `${this.raised} new`;
     byId("alarm-none").hidden = list.length > 0 || !byId("alarm-error").hidden || this.problem !== null;
     byId("alarm-more").hidden = !this.next;
-    const focused = document.activeElement?.closest?.("[data-alarm]")?.dataset.alarm;
+    const [focused, act] = [document.activeElement?.closest?.("[data-alarm]")?.dataset.alarm, document.activeElement?.dataset?.do];
     // Unchanged items keep their nodes: a click must not fall between two copies of a button.
     const before = this.items;
     this.items = new Map(list.map((alarm) => {
-      const said = JSON.stringify(alarm);
+      const said = this.content(alarm);
       const old = before.get(alarm.id);
       return [alarm.id, old?.said === said ? old : { said, node: this.item(alarm) }];
     }));
     settle(byId("alarm-list"), [...this.items.values()].map(({ node }) => node));
-    if (focused && !byId("alarm-list").contains(document.activeElement)) byId("alarm-list").querySelector(`[data-alarm="${CSS.escape(focused)}"] button`)?.focus();
+    if (focused && document.activeElement === document.body) {
+      const item = byId("alarm-list").querySelector(`[data-alarm="${CSS.escape(focused)}"]`);
+      (item?.querySelector(`[data-do="${CSS.escape(act ?? "")}"]`) ?? item?.querySelector("button"))?.focus();
+    }
   }
 
   item(alarm) {
@@ -210,8 +224,8 @@ export class Alarms {
     const subject = subjectOf(alarm);
     const where = subject ? `${subject} · ${alarm.feeder}` : alarm.feeder;
     const since = alarm.state === "cleared"
-      ? `${clock(alarm.t_raised)}, cleared after ${duration(alarm.t_cleared - alarm.t_raised)}`
-      : `since ${clock(alarm.t_raised)}`;
+      ? el("span", { class: "quiet", text: `${clock(alarm.t_raised)}, cleared after ${duration(alarm.t_cleared - alarm.t_raised)}` })
+      : sinceNode(alarm.t_raised);
     const answered = alarm.acknowledged_by
       ? el("p", { class: "answer" }, `Acknowledged by ${alarm.acknowledged_by}`, alarm.comment ? el("q", { text: alarm.comment }) : null)
       : null;
@@ -220,56 +234,89 @@ export class Alarms {
         el("p", { class: "name" },
           el("b", { text: KIND[alarm.kind] ?? alarm.kind }),
           el("span", { class: "severity", text: alarm.severity }),
-          alarm.count > 1 ? el("span", { class: "times", title: "number of occurrences", text: `× ${alarm.count}` }) : null),
+          alarm.count > 1 ? el("span", { class: "times", title: "number of occurrences", text: `× ${alarm.count}` }) : null,
+          guideLink(alarm.kind)),
         el("p", {}, el("a", { href: `#${encodeURIComponent(alarm.feeder)}`, class: "where", text: where, on: { click: (event) => {
           event.preventDefault();
           this.onPick(alarm.feeder, alarm.meter, alarm.customer);
         } } })),
         el("p", { class: "numbers", text: numbers }),
         alarm.kind === "meter-manipulated" ? hint(e) : null,
-        el("p", { class: "quiet since", text: since }),
-        alarm.meter && this.onSeries ? el("button", { type: "button", class: "plain", text: "Time series", on: { click: () => this.onSeries(alarm) } }) : null,
-        answered),
-      alarm.acknowledged_by === null
-        ? el("button", { type: "button", class: "ack", text: "Acknowledge", on: { click: () => this.ask(alarm) } })
-        : null);
+        el("p", { class: "since" }, since),
+        answered,
+        el("p", { class: "tools more" },
+          this.answerButton(alarm),
+          alarm.meter && this.onSeries ? this.button("series", "Time series", () => this.onSeries(alarm)) : null,
+          this.button("comment", "Comment", () => this.ask("comment", alarm)),
+          el("button", { type: "button", class: "plain", "data-do": "log", "aria-expanded": String(this.logs.has(alarm.id)), text: "Log", on: { click: () => this.toggleLog(alarm.id) } })),
+        this.log(alarm.id)));
   }
 
-  ask(alarm) {
-    this.asking = alarm;
-    byId("ack-what").textContent = `${KIND[alarm.kind] ?? alarm.kind}: ${subjectOf(alarm) || alarm.feeder}. ${alarm.reason}`;
-    session.ask("ack-who");
-    byId("ack-comment").value = "";
-    byId("ack-error").hidden = true;
-    byId("ack").showModal();
+  // Acknowledgement of an open alarm, or its withdrawal while the alarm is active.
+  answerButton(alarm) {
+    const made = (kind, name, text) => el("button", { type: "button", class: kind, "data-do": name, text, on: { click: () => this.ask(name, alarm) } });
+    if (alarm.acknowledged_by === null) return made("ack", "ack", "Acknowledge");
+    return alarm.state === "acknowledged" ? made("withdraw", "unack", "Withdraw") : null;
   }
 
-  async answer(event) {
-    event.preventDefault();
-    if (!session.complete("ack-who")) {
-      this.complain("Please enter your name.");
-      return;
+  button(name, text, click) {
+    return el("button", { type: "button", class: "plain", "data-do": name, text, on: { click } });
+  }
+
+  // ------------------------------------------------------------------ the log
+
+  log(id) {
+    if (!this.logs.has(id)) return null;
+    const found = this.logs.get(id);
+    if (found === null) return el("p", { class: "quiet", text: "Loading …" });
+    if (found instanceof Error) return el("p", { class: "error", text: `Log not loaded: ${found.message}` });
+    return el("ol", { class: "log", "aria-label": "Log of the alarm" }, ...found.filter(({ change }) => change !== "updated").map((event) => {
+      const { t, change, comment } = event;
+      const by = event.who ? ` by ${event.who}` : "";
+      return el("li", {}, el("time", { text: clock(t) }), ` ${CHANGE[change] ?? change}${by}`, comment ? el("q", { text: comment }) : null);
+    }));
+  }
+
+  async toggleLog(id) {
+    if (this.logs.delete(id)) this.logged();
+    else {
+      this.logs.set(id, null);
+      this.logged();
+      await this.loadLog(id);
     }
-    const given = { ...session.operator("ack-who"), comment: byId("ack-comment").value, count: this.asking.count };
-    try {
-      const response = await fetch(`${API}/${encodeURIComponent(this.asking.id)}/ack`, {
-        method: "POST",
-        headers: { "Content-Type": "application/json" },
-        body: JSON.stringify(given),
-      });
-      const body = await response.json();
-      if (!response.ok) throw new Error(body.detail);
-      this.put(body);
-      this.onChange();
-      this.render();
-      byId("ack").close();
-    } catch (error) {
-      this.complain(`Not acknowledged: ${error.message}`);
-    }
   }
 
-  complain(text) {
-    byId("ack-error").textContent = text;
-    byId("ack-error").hidden = false;
+  async loadLog(id) {
+    const found = await getJson(`${API}/${encodeURIComponent(id)}/events?limit=1000`).then(({ events }) => events, (error) => error);
+    if (!this.logs.has(id)) return;
+    this.logs.set(id, found);
+    this.logged();
+  }
+
+  logged() {
+    this.render();
+    this.onLog();
+  }
+
+  // Content of an item, for the comparison with the drawn one.
+  content(alarm) {
+    const log = this.logs.get(alarm.id);
+    return JSON.stringify([alarm, log instanceof Error ? log.message : log]);
+  }
+
+  // ------------------------------------------------------------------ actions
+
+  ask(name, alarm) {
+    ask({
+      ...ACTIONS[name],
+      what: `${KIND[alarm.kind] ?? alarm.kind}: ${subjectOf(alarm) || alarm.feeder}. ${alarm.reason}`,
+      send: async (by, { text }) => {
+        const more = name === "ack" ? { count: alarm.count } : {};
+        this.put(await post(`${API}/${encodeURIComponent(alarm.id)}/${name}`, { ...by, comment: text, ...more }));
+        if (this.logs.has(alarm.id)) this.loadLog(alarm.id);
+        this.onChange();
+        this.render();
+      },
+    });
   }
 }

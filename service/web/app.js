@@ -5,7 +5,7 @@ import { Incidents } from "./incidents.js";
 import { Commissioning } from "./commissioning.js";
 import { showDetail } from "./detail.js";
 import { Diagram } from "./diagram.js";
-import { bare, busbarWords, byId, clock, deviceName, duration, el, getJson, isKnown, signed, status } from "./dom.js";
+import { APART, ages, bare, busbarWords, byId, clock, deviceName, duration, el, getJson, isKnown, signed, status } from "./dom.js";
 import { Fleet } from "./fleet.js";
 import { session } from "./session.js";
 import { Banner, offline } from "./banner.js";
@@ -14,7 +14,7 @@ import { Series } from "./series.js";
 const API = "/api/v1/feeders";
 const KEPT = 600;
 
-const page = { feeder: null, report: null, refused: null, selected: null, source: null, retry: null, heard: null, word: "…", others: 0, linked: true, alarmsLinked: true, past: new Map(), turn: 0 };
+const page = { feeder: null, report: null, refused: null, code: null, selected: null, source: null, retry: null, heard: null, word: "…", others: 0, linked: true, alarmsLinked: true, past: new Map(), turn: 0 };
 const diagram = new Diagram({ onSelect: (id) => select(id === page.selected ? null : id) });
 const pick = async (feeder, meter, owner) => {
   if (feeder !== page.feeder?.name) await show(feeder);
@@ -71,7 +71,8 @@ async function start() {
     return;
   }
   if (!feeders.length) {
-    byId("reason").textContent = "The service monitors no feeder yet.";
+    banner.empty("The service monitors no feeder yet.");
+    byId("next").hidden = true;
     setTimeout(start, 5000);
     return;
   }
@@ -89,7 +90,7 @@ async function show(name, query = new URLSearchParams()) {
   if (turn !== page.turn) return; // The response belongs to an earlier choice.
   if (found instanceof Error) {
     if (found.status === 401) await session.begin();
-    else if (found.answered) refused(name, found.message);
+    else if (found.answered) refused(name, found);
     else page.linked = false;
     page.retry = setTimeout(() => show(name, query), 3000);
     return;
@@ -115,8 +116,8 @@ async function show(name, query = new URLSearchParams()) {
 }
 
 // The service responds with the reason why this feeder is not monitored.
-function refused(name, why) {
-  Object.assign(page, { feeder: null, report: null, heard: null, past: new Map(), refused: why, linked: true });
+function refused(name, { message, code }) {
+  Object.assign(page, { feeder: null, report: null, heard: null, past: new Map(), refused: message, code, linked: true });
   fleet.select(name);
   series.watch(null);
   address(name);
@@ -181,8 +182,9 @@ function verdict() {
   byId("busbar-meter").hidden = !report?.busbar?.suspect;
   byId("busbar-meter").textContent = report?.busbar?.suspect ? busbarWords(report.busbar) : "";
   if (!report) {
-    banner.empty(page.refused ?? "Waiting for the first tick.");
-    title(page.refused ? "NOT MONITORED" : "NO DATA");
+    banner.place(feeder ?? { name: wanted().name });
+    banner.empty(page.refused ?? "Waiting for the first tick.", page.refused ? page.code : null);
+    title(page.refused ? APART[page.code] ?? "NOT MONITORED" : "NO DATA");
     return;
   }
   const several = diagram.level === null;
@@ -209,8 +211,9 @@ function unmeasured(report) {
 function fresh() {
   const age = page.heard === null ? null : (performance.now() - page.heard) / 1000;
   const waiting = page.report === null;
+  const apart = APART[(page.report?.displayed ?? page.report)?.cause];
   const stale = age !== null && age > page.feeder.patience_s;
-  const state = !page.linked ? "lost" : stale ? "stale" : page.refused ? "refused" : waiting ? "connecting" : page.report.model_only ? "nodata" : "live";
+  const state = !page.linked ? "lost" : stale ? "stale" : page.refused ? "refused" : waiting ? "connecting" : page.report.model_only ? (apart ? "apart" : "nodata") : "live";
   const shown = state === "live" && !page.alarmsLinked ? "alarms" : state;
   const words = {
     live: "live",
@@ -219,6 +222,7 @@ function fresh() {
     alarms: "connection lost for alarms",
     lost: age === null ? "connection lost" : `connection lost, data ${duration(age)} old`,
     stale: `data stale, ${duration(age ?? 0)} old`,
+    apart: "not evaluated",
     nodata: waiting ? "" : unmeasured(page.report),
   };
   byId("link").dataset.state = shown;
@@ -228,16 +232,19 @@ function fresh() {
   const believable = state === "live";
   offline(state, page.report, age);
   byId("main").dataset.fresh = believable ? "yes" : "no";
+  byId("main").dataset.state = state;
+  if (page.report) ages(page.report.t + (age ?? 0));
   if (state === "nodata") {
     // The model continues without readings; its voltages must not look like measured ones.
-    banner.old("NO DATA", `${words.nodata.replace("n", "N")}. The voltages are those of the model alone. ${page.report.reason}`, "nodata");
+    const { t, t_measured: last } = page.report;
+    banner.old("NO DATA", `${words.nodata.replace("n", "N")}${isKnown(last) ? ` (${duration(t - last)})` : ""}. The voltages are those of the model alone. ${page.report.reason}`, "nodata");
     title("NO DATA");
-  } else if (!believable && !waiting) {
+  } else if (!believable && !waiting && state !== "apart") {
     // An old verdict must not look like a verdict.
     const last = page.report.displayed ?? page.report;
     banner.old("NO LIVE DATA", `No data for ${duration(age)}. Last verdict, at ${clock(page.report.t)}: ${last.verdict}.`, "stale");
     title("NO LIVE DATA");
-  } else if (!waiting && byId("decision").textContent.startsWith("NO ")) {
+  } else if (!waiting && byId("verdict").dataset.verdict === "none") {
     verdict();
   }
 }

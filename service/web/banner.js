@@ -1,33 +1,44 @@
 // Status banner: displayed verdict, its start, its certainty, the next step, and all suspects.
 // The displayed verdict changes only after the delays of the alarms; the verdict of the latest tick stands beside it.
 
-import { byId, clock, deviceName, duration, el, isKnown, signed } from "./dom.js";
+import { APART, GUIDE, byId, clock, deviceName, duration, el, isKnown, signed } from "./dom.js";
 
-const GUIDE = "operator-guide";
 const SHOWN = 8; // Suspects before the button for all.
 const SIGNS = {
   clean: "M5 17l7 7L27 8",
   attacked: "M16 4L29 28H3zM16 12v8M16 23.500v.5",
   undecided: "M10 11a6 6 0 1 1 8 6q-2 1-2 4M16 26.500v.5",
+  apart: "M16 5a11 11 0 1 0 .01 0M8.500 8.500l15 15",
   none: "M16 5a11 11 0 1 0 .01 0M16 9v7l5 3",
 };
 // Next step: sentence, and section of the operator guide.
 const STEPS = {
   clean: ["No action is needed.", "verdict-clean"],
-  attacked: ["Use the reconstructed voltages, and have the named devices inspected.", "verdict-attacked"],
+  meters: ["Use the reconstructed voltages, and have the named meters inspected.", "meter-manipulated"],
+  inverters: ["Have the named inverters inspected, their settings first.", "inverter-manipulated"],
+  both: ["Use the reconstructed voltages, and have the named devices inspected.", "manipulation"],
   files: ["Compare the named customers with the field first: the files may be wrong.", "errors-of-the-files"],
-  undecided: ["Do not rely on the voltages until the cause is found.", "verdict-undecided"],
-  "silent-meters": ["Look for the readings of the silent meters.", "verdict-undecided"],
-  "no-busbar": ["Restore the readings of the busbar meter.", "verdict-undecided"],
-  "missing-powers": ["Restore the power readings of the named customers.", "verdict-undecided"],
-  "clock-offset": ["Set the clock of the named meter.", "verdict-undecided"],
-  settling: ["Wait: the monitor has begun and settles.", "verdict-undecided"],
-  ambiguous: ["Inspect the candidates, the likeliest first.", "verdict-undecided"],
   nodata: ["Restore the connection of the meters.", "no-data"],
   stale: ["Check the service and its connection.", "no-data"],
 };
+// Next step of an undecided verdict by its cause; its section is `undecided-<cause>`.
+const CAUSES = {
+  settling: "Wait: the monitor has begun and settles.",
+  "silent-meters": "Look for the readings of the silent meters.",
+  "too-few-meters": "Restore the readings of the silent meters.",
+  "no-busbar": "Restore the readings of the busbar meter.",
+  "clock-offset": "Set the clock of the named meter.",
+  "missing-powers": "Restore the power readings of the named customers.",
+  ambiguous: "Inspect the candidates, the likeliest first.",
+  "too-many-suspects": "Compare the files with the field, then have the meters inspected.",
+  misfit: "Check neighbouring meters and the feeder's data; do not rely on the voltages.",
+  "design-invalid": "Correct the feeder's files.",
+  overload: "No meter is at fault: monitoring returns when the load of the service fits.",
+  "no-owner": "Wait: another process takes the feeder over. Otherwise check the processes of the service.",
+};
 
 const percent = (share) => `${Math.round(100 * share)} %`;
+const SILENT = 4; // Silent meters beyond this number are one button.
 
 // The displayed verdict of a report; services of earlier versions send the raw one only.
 export function displayed(report) {
@@ -65,14 +76,29 @@ function certainty(report, shown, name) {
     const largest = judged.reduce((a, b) => (ratio(b) > ratio(a) ? b : a));
     return `${tested}; largest score ${percent(ratio(largest))} of its threshold (${name(largest.meter)}).`;
   }
+  if (APART[shown.cause]) return "Not evaluated: neither an attack nor its absence is established.";
   if (report.explanations?.length) return `Possible: ${report.explanations.slice(0, 3).map(explanationWords).join(", or ")}.`;
   return `No answer: neither an attack nor its absence is established. ${tested}.`;
 }
 
+// Number of silent meters, with the longest silence.
+function silence({ silent, meters }) {
+  const longest = Math.max(...silent.map((s) => s.seconds ?? 0));
+  const own = silent.filter((s) => s.meter !== "substation").length;
+  const busbar = own < silent.length ? " and the busbar meter" : "";
+  return `${own} of ${meters.length} meters${busbar} silent, up to ${duration(longest)}`;
+}
+
 function stepOf(report, shown) {
-  if (shown.verdict === "attacked") return report.data_error ? STEPS.files : STEPS.attacked;
   if (shown.verdict === "clean") return STEPS.clean;
-  return STEPS[shown.cause] ?? STEPS.undecided;
+  if (shown.verdict === "undecided") return undecided(shown.cause);
+  if (report.data_error) return STEPS.files;
+  if (shown.inverters.length) return shown.suspects.length ? STEPS.both : STEPS.inverters;
+  return STEPS.meters;
+}
+
+function undecided(cause) {
+  return CAUSES[cause] ? [CAUSES[cause], `undecided-${cause}`] : ["Do not rely on the voltages until the cause is found.", "undecided"];
 }
 
 export class Banner {
@@ -101,12 +127,19 @@ export class Banner {
       el("a", { href: `${GUIDE}#${section ?? ""}`, target: "_blank", rel: "noopener", text: "Operator guide" }));
   }
 
-  // Before the first tick, or with the reason why a feeder is not monitored.
-  empty(reason) {
-    this.decision("none", "NO DATA");
+  // Title of the feeder, and its name if the title does not contain it.
+  place({ name, title } = {}) {
+    const also = title && name && !title.toLowerCase().includes(name.toLowerCase()) ? ` (${name})` : "";
+    byId("place").textContent = `${title || name || ""}${also}`;
+  }
+
+  // Before the first tick, or with the reason why a feeder is not monitored; `cause` is the code of the reason.
+  empty(reason, cause = null) {
+    if (APART[cause]) this.decision("apart", APART[cause]);
+    else this.decision("none", "NO DATA");
     byId("reason").textContent = reason;
     for (const id of ["since", "certainty"]) byId(id).textContent = "";
-    this.next(STEPS.nodata);
+    this.next(CAUSES[cause] ? undecided(cause) : STEPS.nodata);
     this.offsets.clear();
     byId("chips").replaceChildren();
     byId("facts").replaceChildren();
@@ -127,8 +160,10 @@ export class Banner {
       this.offsets.clear();
     }
     const shown = displayed(report);
-    const word = shown.verdict.toUpperCase();
-    this.decision(shown.verdict, word);
+    const apart = shown.verdict === "undecided" ? APART[shown.cause] : undefined;
+    const word = apart ?? shown.verdict.toUpperCase();
+    this.place(feeder);
+    this.decision(apart ? "apart" : shown.verdict, word);
     const raw = report.verdict !== shown.verdict;
     byId("reason").textContent = raw ? shown.reason : report.reason;
     const since = isKnown(shown.since) ? `Since ${clock(shown.since)} (${duration(report.t - shown.since)}).` : "";
@@ -158,13 +193,21 @@ export class Banner {
       ...shown.inverters.map((c) => chip("suspect", `inverter of ${c}${kvar(c)}`, () => this.onSelect(c))),
       ...[...new Set(candidates)].filter((one) => !accused.has(one)).map((one) =>
         chip("doubtful", `candidate ${this.name(one)}`, () => (customer.has(one) || one === "substation" ? go(one) : this.onSelect(one)))),
-      ...report.silent.map((s) => chip("silent", `${this.name(s.meter)} silent ${isKnown(s.seconds) ? duration(s.seconds) : ""}`, () => go(s.meter))),
+      ...(report.silent.length > SILENT && !this.all
+        ? [chip("silent", silence(report), () => this.unfold(report, shown))]
+        : report.silent.map((s) => chip("silent", `${this.name(s.meter)} silent ${isKnown(s.seconds) ? duration(s.seconds) : ""}`, () => go(s.meter)))),
     ];
     const rest = every.length - SHOWN;
     const more = rest > 0
-      ? [el("button", { type: "button", class: "plain", "aria-expanded": String(this.all), text: this.all ? "Show fewer" : `Show all ${every.length}`, on: { click: () => { this.all = !this.all; this.chips(report, shown); byId("chips").lastElementChild.focus(); } } })]
+      ? [el("button", { type: "button", class: "plain", "aria-expanded": String(this.all), text: this.all ? "Show fewer" : `Show all ${every.length}`, on: { click: () => this.unfold(report, shown) } })]
       : [];
     byId("chips").replaceChildren(...(rest > 0 && !this.all ? every.slice(0, SHOWN) : every), ...more);
+  }
+
+  unfold(report, shown) {
+    this.all = !this.all;
+    this.chips(report, shown);
+    byId("chips").lastElementChild.focus();
   }
 
   facts(report, shown, range) {

@@ -1,7 +1,7 @@
-// Commissioning: a line for the feeder, numbers for a meter, and the dialogue for a replaced meter.
+// Commissioning: a line for the feeder, numbers for a meter, and the form for a replaced meter.
 
+import { ask, post } from "./actions.js";
 import { byId, deviceName, getJson, isKnown, signed } from "./dom.js";
-import { session } from "./session.js";
 
 const API = "/api/v1/feeders";
 const EVERY_MS = 60000;
@@ -18,7 +18,7 @@ const REASON = {
 
 function hours(seconds) {
   const h = seconds / 3600;
-  return h >= 10 || Number.isInteger(h) ? String(Math.floor(h)) : h.toFixed(1);
+  return h >= 10 || h < 0.05 || Number.isInteger(h) ? String(Math.floor(h)) : h.toFixed(1);
 }
 
 const day = (t) => new Date(t * 1000).toLocaleDateString();
@@ -41,9 +41,6 @@ export class Commissioning {
     this.onChange = onChange;
     this.feeder = null;
     this.known = null;
-    this.asking = null;
-    byId("renew-form").addEventListener("submit", (event) => this.answer(event));
-    byId("renew-cancel").addEventListener("click", () => byId("renew").close());
     setInterval(() => this.load(), EVERY_MS);
   }
 
@@ -92,40 +89,18 @@ export class Commissioning {
   }
 
   ask(meter, customer) {
-    this.asking = meter;
-    byId("renew-what").textContent = `Meter ${deviceName(meter, customer)} of ${this.feeder}: its own error is deleted and learned again, `
-      + `over ${hours(this.known.needed_s)} h. The other meters stay unchanged.`;
-    session.ask("renew-who");
-    byId("renew-reason").value = "";
-    byId("renew-error").hidden = true;
-    byId("renew").showModal();
-  }
-
-  async answer(event) {
-    event.preventDefault();
-    const reason = byId("renew-reason").value.trim();
-    if (!session.complete("renew-who") || !reason) {
-      this.complain("Please enter your name and the reason.");
-      return;
-    }
-    const given = { ...session.operator("renew-who"), reason, meters: [this.asking] };
-    try {
-      const response = await fetch(`${API}/${encodeURIComponent(this.feeder)}/commissioning`, {
-        method: "POST",
-        headers: { "Content-Type": "application/json" },
-        body: JSON.stringify(given),
-      });
-      const body = await response.json();
-      if (!response.ok) throw new Error(body.detail);
-      if (body.feeder === this.feeder) this.take(body);
-      byId("renew").close();
-    } catch (error) {
-      this.complain(`Not started: ${error.message}`);
-    }
-  }
-
-  complain(text) {
-    byId("renew-error").textContent = text;
-    byId("renew-error").hidden = false;
+    const { feeder } = this;
+    ask({
+      title: "Meter replaced",
+      what: `Meter ${deviceName(meter, customer)} of ${feeder}: its own error is deleted and learned again, `
+        + `over ${hours(this.known.needed_s)} h. The other meters stay unchanged.`,
+      verb: "Learn anew",
+      text: "Reason",
+      needed: true,
+      send: async (by, { text }) => {
+        const body = await post(`${API}/${encodeURIComponent(feeder)}/commissioning`, { ...by, reason: text, meters: [meter] });
+        if (body.feeder === this.feeder) this.take(body);
+      },
+    });
   }
 }

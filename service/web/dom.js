@@ -18,13 +18,19 @@ export const svg = (tag, attributes = {}, ...children) =>
   fill(document.createElementNS(SVG, tag), attributes, children);
 export const byId = (id) => document.getElementById(id);
 
+// Words of causes: the service does not evaluate the readings. Such a feeder is neither clean nor without data.
+export const APART = { overload: "SHED", "no-owner": "NO OWNER" };
+
 const known = (value) => typeof value === "number" && Number.isFinite(value);
 const minus = (text) => text.replace("-", "−");
 
 export const volt = (value, digits = 1) => (known(value) ? `${minus(value.toFixed(digits))} V` : "–");
 export const bare = (value, digits = 1) => (known(value) ? minus(value.toFixed(digits)) : "–");
-export const signed = (value, digits = 1) =>
-  known(value) ? `${value > 0 ? "+" : ""}${minus(value.toFixed(digits))}` : "–";
+export function signed(value, digits = 1) {
+  if (!known(value)) return "–";
+  const text = value.toFixed(digits);
+  return Number(text) === 0 ? (0).toFixed(digits) : `${value > 0 ? "+" : ""}${minus(text)}`;
+}
 export const isKnown = known;
 
 // Name of a meter: its id, then its customer. Ids that are the same stand once; a customer without a meter alone.
@@ -40,6 +46,23 @@ export function duration(seconds) {
   if (s < 7200) return `${Math.round(s / 60)} min`;
   if (s < 172800) return `${Math.round(s / 3600)} h`;
   return `${Math.round(s / 86400)} days`;
+}
+
+export const GUIDE = "operator-guide";
+
+// Link to the section of a kind of alarms or incidents.
+export const guideLink = (kind) => el("a", { class: "guide-link", href: `${GUIDE}#${kind}`, target: "_blank", rel: "noopener", text: "What to do" });
+
+// Begin of a state; `ages` adds its duration.
+export const sinceNode = (t) => el("span", { class: "quiet", "data-since": t, text: `since ${clock(t)}` });
+
+// Durations up to now, Unix s by the service's clock.
+export function ages(now) {
+  for (const node of document.querySelectorAll("[data-since]")) {
+    const t = Number(node.dataset.since);
+    const text = `since ${clock(t)}${now >= t ? ` (${duration(now - t)})` : ""}`;
+    if (node.textContent !== text) node.textContent = text;
+  }
 }
 
 export function clock(t, { day = false } = {}) {
@@ -83,7 +106,7 @@ export function nominals(feeder) {
 export async function getJson(url) {
   const response = await fetch(url, { headers: { Accept: "application/json" } });
   const body = await response.json().catch(() => ({}));
-  if (!response.ok) throw Object.assign(new Error(body.detail || `${response.status} ${response.statusText}`), { answered: true, status: response.status });
+  if (!response.ok) throw Object.assign(new Error(body.detail || `${response.status} ${response.statusText}`), { answered: true, status: response.status, code: body.code });
   return body;
 }
 

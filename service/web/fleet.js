@@ -1,21 +1,32 @@
 // All feeders, the worst first: verdict, its duration, suspects, silent meters, alarms. Shown with two feeders or
 // more. The service sorts and filters; the page loads and draws the rows that are visible, whatever their number.
 
-import { byId, duration, el, getJson, isKnown, settle } from "./dom.js";
+import { APART, byId, duration, el, getJson, isKnown, settle } from "./dom.js";
 import { session } from "./session.js";
 
 const API = "/api/v1/feeders";
 const EVERY_MS = 2000;
 const SHARE = 10; // A request takes at most this part of the time between two of them.
-const SHOWN = 8; // Rows of the short list.
 const HEAD = 50; // Feeders in the selector.
 const PAGE = 80; // Rows that are loaded around the visible ones.
 const AROUND = 8; // Rows that are drawn above and below the visible ones.
 const NARROW = matchMedia("(max-width: 620px)");
+const shortest = () => (NARROW.matches ? 5 : 8); // Rows of the short list.
 const rowHeight = () => (NARROW.matches ? 46 : 33); // Height of a row, px, as in the style sheet.
 const WORDS = { attacked: "ATTACKED", undecided: "UNDECIDED", "no-data": "NO DATA", "not-monitored": "NOT MONITORED", clean: "CLEAN" };
 
 const titleOf = (feeder) => feeder.title || feeder.name;
+const stateOf = (feeder) => (APART[feeder.cause] && feeder.status === "undecided" ? "apart" : feeder.status);
+const wordOf = (feeder) => (stateOf(feeder) === "apart" ? APART[feeder.cause] : WORDS[feeder.status]);
+
+// Duration of the displayed verdict, or the time since the newest trusted reading.
+function lasting(feeder) {
+  const { t, age_s: age, t_measured: measured, status } = feeder;
+  if (!isKnown(t)) return "";
+  if (status === "no-data") return isKnown(measured) ? duration(t - measured + (age ?? 0)) : "";
+  const begun = feeder.displayed_since ?? feeder.since;
+  return isKnown(begun) && status === (feeder.displayed_verdict ?? feeder.verdict) ? duration(t - begun) : "";
+}
 
 export class Fleet {
   constructor({ onPick, onChange }) {
@@ -24,6 +35,7 @@ export class Fleet {
     this.head = []; // The worst feeders.
     this.beside = new Map(); // Latest entry of every feeder that was loaded last.
     this.counts = {};
+    this.causes = {}; // Numbers of feeders that are not evaluated, by cause.
     this.size = this.total = 0; // Number of feeders, and of those that fit the filters.
     this.rows = { offset: 0, feeders: [] }; // Loaded part of the long list.
     this.states = new Set();
@@ -79,8 +91,8 @@ export class Fleet {
     return Math.max(EVERY_MS, SHARE * (performance.now() - begun));
   }
 
-  take({ feeders, counts, total }) {
-    Object.assign(this, { counts, size: total });
+  take({ feeders, counts, causes = {}, total }) {
+    Object.assign(this, { counts, causes, size: total });
     this.head = feeders.slice(0, Math.min(HEAD, total));
     this.keep(feeders);
     this.render();
@@ -165,13 +177,13 @@ export class Fleet {
     this.selector();
     if (!several) return;
     this.tally();
-    const [first, last] = this.long ? this.window() : [0, Math.min(SHOWN, this.head.length)];
+    const [first, last] = this.long ? this.window() : [0, Math.min(shortest(), this.head.length)];
     const { offset, feeders } = this.long ? this.rows : { offset: 0, feeders: this.head };
     const shown = feeders.slice(Math.max(0, first - offset), Math.max(0, last - offset));
     const start = Math.max(first, offset);
     const open = this.long;
     byId("fleet-more").textContent = open
-      ? `${this.total} of ${this.size}` : this.size > SHOWN ? `${this.size - SHOWN} further feeders` : "";
+      ? `${this.total} of ${this.size}` : this.size > shortest() ? `${this.size - shortest()} further feeders` : "";
     const before = this.nodes;
     this.nodes = new Map(shown.map((feeder, k) => {
       const said = JSON.stringify([this.cells(feeder), feeder.name === this.selected, start + k]);
@@ -206,7 +218,7 @@ export class Fleet {
     const options = listed.map((feeder) => {
       const option = before.get(feeder.name) ?? el("option", { value: feeder.name });
       option.dataset.title = titleOf(feeder);
-      const text = `${(feeder.name === this.selected && this.word) || WORDS[feeder.status]} – ${titleOf(feeder)}`;
+      const text = `${(feeder.name === this.selected && this.word) || wordOf(feeder)} – ${titleOf(feeder)}`;
       if (option.textContent !== text) option.textContent = text;
       return option;
     });
@@ -223,7 +235,9 @@ export class Fleet {
     const before = new Map([...byId("fleet-counts").children].map((node) => [node.dataset.state, node]));
     settle(byId("fleet-counts"), states.map((state) => {
       const node = before.get(state) ?? el("button", { type: "button", class: "fleet-state", "data-state": state, title: "Show these only", on: { click: () => this.filter(state) } });
-      const text = `${this.counts[state] ?? 0} ${WORDS[state].toLowerCase()}`;
+      const apart = Object.entries(this.causes).filter(([, count]) => state === "undecided" && count > 0);
+      const of = apart.length ? `: ${apart.map(([cause, count]) => `${count} ${APART[cause].toLowerCase()}`).join(", ")}` : "";
+      const text = `${this.counts[state] ?? 0} ${WORDS[state].toLowerCase()}${of}`;
       if (node.textContent !== text) node.textContent = text;
       node.setAttribute("aria-pressed", String(this.states.has(state)));
       return node;
@@ -231,17 +245,16 @@ export class Fleet {
   }
 
   cells(feeder) {
-    const begun = feeder.displayed_since ?? feeder.since;
-    const since = isKnown(begun) && isKnown(feeder.t) && feeder.status === (feeder.displayed_verdict ?? feeder.verdict) ? duration(feeder.t - begun) : "";
     const silent = feeder.meters ? `${Math.round((100 * feeder.silent) / feeder.meters)} %` : "";
-    return [feeder.status, titleOf(feeder), since, String(feeder.suspects || ""), silent, String(feeder.alarms || ""), feeder.raised ? `, ${feeder.raised} new` : ""];
+    return [stateOf(feeder), wordOf(feeder), titleOf(feeder), lasting(feeder), String(feeder.suspects || ""), silent, String(feeder.alarms || ""), feeder.raised ? `, ${feeder.raised} new` : ""];
   }
 
   row(feeder, k) {
-    const [state, title, since, suspects, silent, alarms, fresh] = this.cells(feeder);
+    const [state, word, title, since, suspects, silent, alarms, fresh] = this.cells(feeder);
     return el("tr", { "data-state": state, "data-feeder": feeder.name, "aria-rowindex": k + 2, "aria-current": feeder.name === this.selected ? "true" : null },
-      el("td", {}, el("span", { class: "fleet-state", "data-state": state, text: WORDS[state] })),
-      el("th", { scope: "row" }, el("button", { type: "button", class: "plain", text: title, title, on: { click: () => this.onPick(feeder.name) } })),
+      el("td", {}, el("span", { class: "fleet-state", "data-state": state, text: word })),
+      el("th", { scope: "row" }, el("button", { type: "button", class: "plain", text: title, title, on: { click: () => this.onPick(feeder.name) } }),
+        title.toLowerCase().includes(feeder.name.toLowerCase()) ? null : el("span", { class: "quiet own-name", text: feeder.name })),
       el("td", { class: "num", text: since }),
       el("td", { class: "num", text: suspects }),
       el("td", { class: "num", text: silent }),
@@ -251,7 +264,7 @@ export class Fleet {
   // Arrow keys walk through all rows, also those that are not loaded yet.
   key(event) {
     const row = event.target.closest("tr[data-feeder]");
-    const last = (this.long ? this.total : Math.min(SHOWN, this.head.length)) - 1;
+    const last = (this.long ? this.total : Math.min(shortest(), this.head.length)) - 1;
     const now = Number(row?.getAttribute("aria-rowindex")) - 2;
     const next = { ArrowDown: now + 1, ArrowUp: now - 1, Home: 0, End: last }[event.key];
     if (!row || next === undefined) return;

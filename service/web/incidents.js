@@ -1,6 +1,7 @@
 // Incident list: one line per incident, expandable to its alarms and its log; actions of operators; hand-over.
 
-import { byId, clock, duration, el, getJson, isKnown, settle } from "./dom.js";
+import { ask, post } from "./actions.js";
+import { byId, clock, duration, el, getJson, guideLink, isKnown, settle, sinceNode } from "./dom.js";
 import { session } from "./session.js";
 
 const API = "/api/v1";
@@ -20,14 +21,15 @@ const CHANGE = {
   "work-begun": "planned work begun", "work-ended": "planned work ended",
 };
 const ACTIONS = {
-  ack: { title: "Acknowledge incident", verb: "Acknowledge", key: "a", text: "Comment", path: "ack" },
-  unack: { title: "Withdraw acknowledgement", verb: "Withdraw", key: "u", text: "Comment", path: "unack" },
-  comment: { title: "Comment", verb: "Add comment", key: "c", text: "Comment", needed: true, path: "comment" },
-  assign: { title: "Assign incident", verb: "Assign", key: "g", text: "Comment", path: "assign", to: true },
-  shelve: { title: "Shelve alarms", verb: "Shelve", key: "s", text: "Reason", needed: true, duration: true },
-  work: { title: "Planned work", verb: "Enter", text: "Reason", needed: true, times: true },
+  ack: { title: "Acknowledge incident", verb: "Acknowledge", key: "a" },
+  unack: { title: "Withdraw acknowledgement", verb: "Withdraw", key: "u" },
+  comment: { title: "Comment on incident", verb: "Add comment", key: "c", needed: true },
+  assign: { title: "Assign incident", verb: "Assign", key: "g" },
+  shelve: { title: "Shelve alarms", verb: "Shelve", key: "s", text: "Reason", needed: true },
+  work: { title: "Planned work", verb: "Enter", text: "Reason", needed: true },
 };
 const HOURS = [1, 4, 8, 24, 72, 168];
+const BUSBAR = "substation";
 const PAGE = 50;
 const ALARMS_SHOWN = 100;
 const METERS_LISTED = 20; // Largest number of meters in the choice of a shelf.
@@ -35,17 +37,22 @@ const EVERY_MS = 5000;
 const SOON_MS = 200;
 
 const plural = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
-const local = (t) => {
-  const date = new Date(t * 1000);
-  return new Date(date - date.getTimezoneOffset() * 60000).toISOString().slice(0, 16);
-};
-
 // Devices of an incident: one by name, several by number.
 function subject({ meters, customers }) {
-  if (meters.length > 1) return plural(meters.length, "meter");
-  if (meters.length === 1) return meters[0];
+  const own = meters.filter((meter) => meter !== BUSBAR);
+  const busbar = own.length < meters.length;
+  if (own.length) return `${own.length > 1 ? plural(own.length, "meter") : own[0]}${busbar ? " and the busbar meter" : ""}`;
+  if (busbar) return "busbar meter";
   if (customers.length) return customers.length === 1 ? customers[0] : plural(customers.length, "inverter");
   return null;
+}
+
+// Sentence on an incident: the devices of a manipulation, otherwise the reason of its severest alarm.
+function reasonOf({ kind, meters, customers, reason }) {
+  const named = [...meters, ...customers.map((customer) => `inverter of ${customer}`)];
+  if (kind !== "manipulation" || !named.length) return reason;
+  const more = named.length > METERS_LISTED ? ` and ${named.length - METERS_LISTED} more` : "";
+  return named.length === 1 ? `${named[0]} ${reason}` : `Named as manipulated: ${named.slice(0, METERS_LISTED).join(", ")}${more}.`;
 }
 
 export class Incidents {
@@ -60,17 +67,15 @@ export class Incidents {
     this.turn = 0;
     this.soon = null;
     this.most = 86400;
-    this.asking = null;
     for (const id of ["incident-state", "incident-kind", "incident-severity", "incident-since", "incident-scope", "incident-sort"]) byId(id).addEventListener("change", () => this.reload());
     byId("incident-text").addEventListener("input", () => this.later());
     byId("incident-more").addEventListener("click", () => { this.limit += PAGE; this.reload(); });
     byId("incident-list").addEventListener("keydown", (event) => this.key(event));
-    byId("act-form").addEventListener("submit", (event) => this.send(event));
-    byId("act-cancel").addEventListener("click", () => byId("act").close());
     byId("shift-open").addEventListener("click", () => this.shift());
     byId("shift-close").addEventListener("click", () => byId("shift").close());
     byId("shift-since").addEventListener("change", () => this.shift());
     byId("work-open").addEventListener("click", () => this.ask("work"));
+    alarms.onLog = () => this.render();
     setInterval(() => this.reload(), EVERY_MS);
   }
 
@@ -105,13 +110,14 @@ export class Incidents {
     try {
       const page = await getJson(`${API}/incidents?${this.query()}`);
       if (turn !== this.turn) return; // The response belongs to an earlier choice.
-      byId("incident-error").hidden = true;
+      byId("incident-error").hidden = byId("incident-loading").hidden = true;
       byId("incident-count").hidden = page.raised === 0;
       byId("incident-count").textContent = `${page.raised} new`;
       byId("incident-more").hidden = page.next === null;
       await this.list(page.incidents);
     } catch (error) {
       if (turn !== this.turn) return;
+      byId("incident-loading").hidden = true;
       byId("incident-error").textContent = `Incidents not loaded: ${error.message}`;
       byId("incident-error").hidden = false;
     }
@@ -137,19 +143,21 @@ export class Incidents {
       this.open.delete(id);
     } else {
       this.open.set(id, null);
+      this.render();
       await this.details(id).catch((error) => this.open.set(id, { problem: error.message }));
     }
     this.render();
   }
 
   render() {
-    byId("incident-none").hidden = this.found.length > 0 || !byId("incident-error").hidden;
+    byId("incident-none").hidden = this.found.length > 0 || !byId("incident-error").hidden || !byId("incident-loading").hidden;
     const focused = document.activeElement?.closest?.("[data-incident]");
     const [own, act] = [focused?.dataset.incident, document.activeElement?.dataset?.act];
     // Unchanged items keep their nodes: a click must not fall between two copies of a button.
     const before = this.items;
     this.items = new Map(this.found.map((incident) => {
-      const said = JSON.stringify([incident, this.open.get(incident.id)]);
+      const open = this.open.get(incident.id);
+      const said = JSON.stringify([incident, open, (open?.alarms ?? []).map((alarm) => this.alarms.content(alarm))]);
       const old = before.get(incident.id);
       return [incident.id, old?.said === said ? old : { said, node: this.item(incident) }];
     }));
@@ -173,7 +181,7 @@ export class Incidents {
       el("b", { text: KIND[incident.kind] ?? incident.kind }),
       el("span", { class: "place", text: place }),
       el("span", { class: "numbers", text: numbers }),
-      el("span", { class: "quiet", text: `since ${clock(incident.t_first)}` }),
+      sinceNode(incident.t_first),
       note(isKnown(incident.shelved_until) && incident.state !== "cleared" ? `shelved until ${clock(incident.shelved_until)}` : "", "shelved"),
       note(isKnown(incident.planned_until) && incident.state !== "cleared" ? `planned work until ${clock(incident.planned_until)}` : "", "work"),
       note(incident.state === "acknowledged" ? `acknowledged${incident.acknowledged_by ? ` by ${incident.acknowledged_by}` : ""}` : "", "ack"),
@@ -191,15 +199,17 @@ export class Incidents {
       open && incident.unacknowledged ? button("ack", "Acknowledge all") : null,
       open && incident.active > incident.unacknowledged ? button("unack", "Withdraw") : null,
       button("comment", "Comment"), button("assign", "Assign"),
-      open ? button("shelve", "Shelve") : null);
+      open ? button("shelve", "Shelve") : null,
+      guideLink(incident.kind));
     const events = (found?.events ?? []).filter((event) => event.change !== "updated");
     return el("div", { class: "body" },
-      el("p", { class: "reason", text: incident.reason }),
+      el("p", { class: "reason", text: reasonOf(incident) }),
       el("p", {}, el("a", { href: `#${encodeURIComponent(incident.feeder)}`, class: "where", text: `Show ${incident.feeder}`, on: { click: (event) => {
         event.preventDefault();
         this.onPick(incident.feeder, incident.meters[0] ?? null, incident.customers[0] ?? null);
       } } })),
       buttons,
+      found === null ? el("p", { class: "quiet", text: "Loading …" }) : null,
       found?.problem ? el("p", { class: "error", text: `Not loaded: ${found.problem}` }) : null,
       el("ol", { class: "alarm-list", "aria-label": "Alarms of the incident" }, ...(found?.alarms ?? []).map((alarm) => this.alarms.item(alarm))),
       found?.more ? el("p", { class: "quiet", text: `${incident.alarms - ALARMS_SHOWN} more alarms` }) : null,
@@ -237,72 +247,33 @@ export class Incidents {
 
   async ask(name, incident = null) {
     const action = ACTIONS[name];
-    this.asking = { name, incident };
-    byId("act-title").textContent = action.title;
     const about = incident && subject(incident);
-    byId("act-what").textContent = incident
-      ? `${KIND[incident.kind] ?? incident.kind}: ${incident.feeder}${about ? ` · ${about}` : ""}, ${plural(incident.active, "active alarm")}.`
-      : `Alarms of ${this.feeder} are recorded, marked, and do not notify.`;
-    byId("act-send").textContent = action.verb;
-    byId("act-text-name").textContent = action.text;
-    byId("act-text").value = "";
-    byId("act-text").required = Boolean(action.needed);
-    byId("act-to-row").hidden = !action.to;
-    byId("act-to").value = incident?.assigned_to ?? "";
-    byId("act-duration-row").hidden = byId("act-scope-row").hidden = !action.duration;
-    if (action.duration) this.scopes(incident);
-    byId("act-times").hidden = !action.times;
-    for (const id of ["act-from", "act-until"]) byId(id).required = Boolean(action.times);
     const now = Date.now() / 1000;
-    byId("act-from").value = local(now);
-    byId("act-until").value = local(now + 7200);
-    byId("act-error").hidden = true;
-    session.ask("act-who");
-    if (action.duration) await this.durations();
-    byId("act").showModal();
+    const { feeder } = this;
+    ask({
+      ...action,
+      what: incident
+        ? `${KIND[incident.kind] ?? incident.kind}: ${incident.feeder}${about ? ` · ${about}` : ""}, ${plural(incident.active, "active alarm")}.`
+        : `Alarms of ${feeder} are recorded, marked, and do not notify.`,
+      to: name === "assign" ? incident.assigned_to ?? "" : undefined,
+      scope: name === "shelve" ? scopes(incident) : undefined,
+      duration: name === "shelve" ? await this.durations() : undefined,
+      times: name === "work" ? [now, now + 7200] : undefined,
+      send: async (by, values) => {
+        const [url, body] = request(name, incident ?? { feeder }, values);
+        await post(url, { ...by, ...body });
+        this.reload();
+        if (byId("shift").open) this.shift();
+      },
+    });
   }
 
-  // Alarms that a shelf may cover: those of the incident, of one of its meters, of one of its kinds.
-  scopes({ id, feeder, meters, kinds }) {
-    const own = [["this incident", { incident: id }]];
-    for (const meter of meters.slice(0, METERS_LISTED)) own.push([`all of ${meter}`, { feeder, meter }]);
-    for (const kind of kinds) own.push([`all ${kind} of ${feeder}`, { feeder, kind }]);
-    byId("act-scope").replaceChildren(...own.map(([text, value]) => el("option", { value: JSON.stringify(value), text })));
-  }
-
+  // Choice of durations up to the service's limit.
   async durations() {
     const { max_duration_s: most } = await getJson(`${API}/shelves`).catch(() => ({ max_duration_s: this.most }));
     this.most = most;
     const hours = HOURS.filter((each) => each * 3600 <= most);
-    const options = hours.length ? hours.map((each) => [each * 3600, plural(each, "hour")]) : [[most, duration(most)]];
-    byId("act-duration").replaceChildren(...options.map(([value, text]) => el("option", { value, text })));
-  }
-
-  request() {
-    const { name, incident } = this.asking;
-    const text = byId("act-text").value;
-    if (name === "shelve") return [`${API}/shelves`, { ...JSON.parse(byId("act-scope").value), duration_s: Number(byId("act-duration").value), reason: text }];
-    if (name === "work") {
-      const [from, until] = ["act-from", "act-until"].map((id) => new Date(byId(id).value).getTime() / 1000);
-      return [`${API}/planned-work`, { feeder: this.feeder, t_from: from, t_until: until, reason: text }];
-    }
-    const more = { ack: { count: incident.count }, assign: { to: byId("act-to").value.trim() || null } }[name];
-    return [`${API}/incidents/${incident.id}/${ACTIONS[name].path}`, { comment: text, ...more }];
-  }
-
-  async send(event) {
-    event.preventDefault();
-    try {
-      if (!session.complete("act-who")) throw new Error("please enter your name");
-      const [url, body] = this.request();
-      await post(url, { ...session.operator("act-who"), ...body });
-      byId("act").close();
-      this.reload();
-      if (byId("shift").open) this.shift();
-    } catch (error) {
-      byId("act-error").textContent = `Not done: ${error.message}`;
-      byId("act-error").hidden = false;
-    }
+    return hours.length ? hours.map((each) => [each * 3600, plural(each, "hour")]) : [[most, duration(most)]];
   }
 
   // -------------------------------------------------------------- hand-over
@@ -364,9 +335,18 @@ function shelved(one) {
   return `${one.feeder}: ${what}`;
 }
 
-async function post(url, body) {
-  const response = await fetch(url, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
-  const answer = await response.json();
-  if (!response.ok) throw new Error(answer.detail);
-  return answer;
+// Alarms that a shelf may cover: those of the incident, of one of its meters, of one of its kinds.
+function scopes({ id, feeder, meters, kinds }) {
+  const own = [["this incident", { incident: id }]];
+  for (const meter of meters.slice(0, METERS_LISTED)) own.push([`all of ${meter}`, { feeder, meter }]);
+  for (const kind of kinds) own.push([`all ${kind} of ${feeder}`, { feeder, kind }]);
+  return own.map(([text, value]) => [JSON.stringify(value), text]);
+}
+
+// Address and body of an action.
+function request(name, { id, feeder, count }, { text, to, scope, duration: seconds, from, until }) {
+  if (name === "shelve") return [`${API}/shelves`, { ...JSON.parse(scope), duration_s: seconds, reason: text }];
+  if (name === "work") return [`${API}/planned-work`, { feeder, t_from: from, t_until: until, reason: text }];
+  const more = { ack: { count }, assign: { to } }[name];
+  return [`${API}/incidents/${id}/${name}`, { comment: text, ...more }];
 }

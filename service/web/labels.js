@@ -24,6 +24,7 @@ export function placeLabels(marks, others, { width, height }) {
       { x: side, y: middle, anchor: "start" },
       { x: 0, y: above, anchor: "middle" },
       { x: -side, y: middle, anchor: "end" },
+      ...[1, -1].flatMap((k) => [{ x: side, y: middle + k * tall, anchor: "start" }, { x: -side, y: middle + k * tall, anchor: "end" }]),
       ...[1, 2, 3].flatMap((k) => [{ x: 0, y: below + k * tall, anchor: "middle" }, { x: 0, y: above - k * tall, anchor: "middle" }]),
     ];
     const box = ({ x, y, anchor }) => ({

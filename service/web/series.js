@@ -8,12 +8,15 @@ const BUSBAR = "substation";
 const MOST = 6; // Meters in one chart.
 const SPANS = [[3600, "1 h"], [21600, "6 h"], [86400, "24 h"], [604800, "7 d"], [1209600, "14 d"]];
 const [SHORTEST_S, LONGEST_S] = [60, 1209600];
-const [LEFT, RIGHT, LANE, ROW, GAP, AXIS] = [70, 12, 11, 9, 14, 22]; // Margins and heights, px.
+const [LEFT, RIGHT, LANE, ROW, GAP, AXIS] = [70, 12, 11, 9, 24, 22]; // Margins and heights, px.
 const ALARM_ROWS = 4;
 const TABLE_ROWS = 24; // Times in the table.
 const STEPS_S = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400, 172800, 604800];
 const VERDICTS = ["attacked", "undecided", "clean"];
 const DRAG_PX = 6; // A shorter movement of the pointer is a click.
+const NEAR_PX = 30; // Fingers that are nearer count as this far apart.
+const WHEEL = 0.01; // Zoom by the pinch of a touchpad, per px.
+const SETTLED_MS = 250; // Time after the last movement of a wheel before the data are loaded.
 
 // ------------------------------------------------------------------- geometry
 
@@ -128,6 +131,9 @@ export class Series {
     this.report = null;
     this.turn = 0;
     this.pointer = null; // Its place over the chart.
+    this.fingers = new Map(); // Pressed pointers and their places.
+    this.pinch = null; // Distance and middle of two fingers at their press, and the span at that time.
+    this.frame = null;
     this.close({ quiet: true });
     byId("series-spans").replaceChildren(...SPANS.map(([s, text]) =>
       el("button", { type: "button", "data-span": s, text, on: { click: () => this.choose(s) } })));
@@ -145,7 +151,9 @@ export class Series {
     this.chart.addEventListener("pointerdown", (event) => this.press(event));
     this.chart.addEventListener("pointermove", (event) => this.point(event));
     this.chart.addEventListener("pointerup", (event) => this.release(event));
-    this.chart.addEventListener("pointercancel", () => this.forget());
+    this.chart.addEventListener("pointercancel", (event) => this.release(event, { cancelled: true }));
+    this.chart.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
+    this.chart.addEventListener("touchmove", (event) => { if (event.touches.length > 1) event.preventDefault(); }, { passive: false });
     this.chart.addEventListener("pointerleave", () => this.unpoint());
     this.chart.addEventListener("dblclick", () => this.now());
     new ResizeObserver(() => {
@@ -418,6 +426,7 @@ export class Series {
     const more = { count: data.more_alarms ? 1 : 0 };
     for (const alarm of data.alarms) {
       const [a, b] = [Math.max(LEFT, x(alarm.t_raised)), Math.min(right, alarm.t_cleared === null ? right : Math.max(x(alarm.t_cleared), LEFT))];
+      if (x(alarm.t_raised) > right || (alarm.t_cleared !== null && x(alarm.t_cleared) < LEFT)) continue;
       const drawn = Math.max(b, a + 5);
       let row = ends.findIndex((end) => end <= a);
       if (row < 0) row = ends.length;
@@ -460,7 +469,7 @@ export class Series {
         svg("path", { class: "estimated", d: line(of("estimated"), y) }),
         svg("path", { class: "reported", d: line(of("reported"), y) }),
         svg("path", { class: "named", d: named })),
-      svg("text", { class: "meter-name", x: LEFT + 7, y: top + 16, text: this.name(meter.meter) }));
+      svg("text", { class: "meter-name", x: LEFT, y: top - 6, text: this.name(meter.meter) }));
   }
 
   axis(x, { top, bottom, right }) {
@@ -484,11 +493,33 @@ export class Series {
 
   press(event) {
     if (!this.data || event.button !== 0) return;
-    this.drag = { x: event.clientX, t: this.time(event), id: event.pointerId };
+    if (event.isPrimary) this.fingers.clear();
+    this.fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+    if (event.pointerType === "touch") this.chart.setPointerCapture(event.pointerId);
+    this.forget();
+    if (this.fingers.size === 1) this.drag = { x: event.clientX, t: this.time(event), id: event.pointerId };
+    if (this.fingers.size !== 2) return;
+    this.unpoint();
+    const { data, grip } = this;
+    this.pinch = { span: data.to - data.from, apart: grip.apart, t: data.from + grip.share * (data.to - data.from) };
+  }
+
+  // Distance of two fingers, px, and their middle as a share of the width of the plot.
+  get grip() {
+    const [a, b] = [...this.fingers.values()];
+    const wide = Math.max(280, this.width) - RIGHT - LEFT;
+    const middle = 0.5 * (a.x + b.x) - this.chart.getBoundingClientRect().left - LEFT;
+    return { apart: Math.max(NEAR_PX, Math.hypot(a.x - b.x, a.y - b.y)), share: middle / wide };
   }
 
   point(event) {
     if (!this.data) return;
+    if (this.fingers.has(event.pointerId)) this.fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+    if (this.pinch !== null) {
+      const { pinch: { span, apart, t }, grip } = this;
+      this.preview((span * apart) / grip.apart, t, grip.share);
+      return;
+    }
     const { drag } = this;
     if (drag !== null && Math.abs(event.clientX - drag.x) > DRAG_PX) {
       this.chart.setPointerCapture(drag.id);
@@ -499,17 +530,44 @@ export class Series {
     this.readout(this.pointer);
   }
 
-  release(event) {
-    const { drag } = this;
+  release(event, { cancelled = false } = {}) {
+    const { drag, pinch } = this;
+    this.fingers.delete(event.pointerId);
     this.forget();
-    if (drag === null || !this.data || Math.abs(event.clientX - drag.x) <= DRAG_PX) return;
+    if (pinch !== null) {
+      if (this.data) this.set(this.data.from, this.data.to);
+      return;
+    }
+    if (cancelled || drag === null || !this.data || Math.abs(event.clientX - drag.x) <= DRAG_PX) return;
     const [a, b] = [drag.t, this.time(event)].sort((p, q) => p - q);
     this.set(a, b);
   }
 
   forget() {
     this.drag = null;
+    this.pinch = null;
     this.chosenBox?.setAttribute("visibility", "hidden");
+  }
+
+  // The loaded data on another axis: the time t, s, stands at a share of the width.
+  preview(wanted, t, share) {
+    const span = Math.min(LONGEST_S, Math.max(SHORTEST_S, wanted));
+    const until = Math.min(this.present(), t + (1 - share) * span);
+    this.data = { ...this.data, from: until - span, to: until };
+    this.frame ??= requestAnimationFrame(() => { this.frame = null; if (this.data) this.draw(); });
+  }
+
+  // A touchpad: its pinch zooms, two fingers sideways move. The wheel scrolls the page.
+  wheel(event) {
+    if (!this.data || (!event.ctrlKey && Math.abs(event.deltaX) <= Math.abs(event.deltaY))) return;
+    event.preventDefault();
+    const { from, to } = this.data;
+    const wide = Math.max(280, this.width) - RIGHT - LEFT;
+    const t = this.time(event);
+    const moved = event.ctrlKey ? 0 : ((to - from) * event.deltaX) / wide;
+    this.preview((to - from) * (event.ctrlKey ? Math.exp(WHEEL * event.deltaY) : 1), t + moved, (t - from) / (to - from));
+    clearTimeout(this.settled);
+    this.settled = setTimeout(() => { if (this.data) this.set(this.data.from, this.data.to); }, SETTLED_MS);
   }
 
   unpoint() {
@@ -543,7 +601,7 @@ export class Series {
     const act = {
       "+": () => this.zoom(0.5), "=": () => this.zoom(0.5), "-": () => this.zoom(2),
       ArrowLeft: () => this.move(-0.25), ArrowRight: () => this.move(0.25),
-      PageUp: () => this.move(-1), PageDown: () => this.move(1), End: () => this.now(), Escape: () => this.now(),
+      PageUp: () => this.move(-1), PageDown: () => this.move(1), End: () => this.now(), 0: () => this.now(), Escape: () => this.now(),
     }[event.key];
     if (!act || event.ctrlKey || event.metaKey || event.altKey) return;
     event.preventDefault();

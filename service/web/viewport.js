@@ -18,6 +18,8 @@ export class Viewport {
     box.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
     box.addEventListener("pointerdown", (event) => this.down(event));
     box.addEventListener("pointermove", (event) => this.move(event));
+    // Two fingers never scroll the page.
+    box.addEventListener("touchmove", (event) => { if (event.touches.length > 1) event.preventDefault(); }, { passive: false });
     for (const name of ["pointerup", "pointercancel"]) box.addEventListener(name, (event) => this.pointers.delete(event.pointerId));
     // The click at the end of a drag selects nothing.
     box.addEventListener("click", (event) => { if (this.dragged) event.stopPropagation(); this.dragged = false; }, true);

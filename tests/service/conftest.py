@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import os
+import secrets
 import shutil
 import tempfile
 import threading
@@ -19,6 +20,8 @@ from typing import Any
 
 import pytest
 import uvicorn
+from anyio import CapacityLimiter
+from fastapi import FastAPI
 from playwright.sync_api import Browser, sync_playwright
 from pydantic import TypeAdapter
 
@@ -33,7 +36,8 @@ from service.alarms.state_machine import (
     carry,
     conditions,
 )
-from service.api.routes import create_api
+from service.api.routes import ACCESS_THREADS, MAX_STREAMS, create_api
+from service.api.system import Probe
 from service.engine.commissioning import CommissioningProgress
 from service.engine.operators import SHELVE_MOST_S, Operators
 from service.errors import FeederFixed, FeederUnknown, TooManyFeeders
@@ -361,12 +365,27 @@ class SmallService:
         self.store.close()
 
 
+_FREE: list[FastAPI] = []
+"""Applications of stopped servers. Making one takes longer than most tests: all routes are described."""
+
+
+def _application(service: SmallService) -> FastAPI:
+    """Return an application with the state of a new one."""
+    if not _FREE:
+        return create_api(service, ["grid.example"])
+    api = _FREE.pop()
+    api.state.backend, api.state.probe = service, Probe(service.store, None)
+    api.state.run, api.state.access_threads = secrets.token_hex(4), CapacityLimiter(ACCESS_THREADS)
+    api.state.streams, api.state.max_streams = 0, MAX_STREAMS
+    return api
+
+
 class Server:
     """The HTTP application of a SmallService on a free port of this machine, in a thread."""
 
     def __init__(self, service: SmallService, port: int = 0) -> None:
         self.service = service
-        self.api = create_api(service, ["grid.example"])
+        self.api = _application(service)
         config = uvicorn.Config(
             self.api,
             host="127.0.0.1",
@@ -399,6 +418,7 @@ class Server:
         self.thread.join(timeout=20)
         assert not self.thread.is_alive()
         self.service.loop = None
+        _FREE.append(self.api)
 
 
 @pytest.fixture(scope="session")

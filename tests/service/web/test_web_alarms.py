@@ -122,19 +122,61 @@ def test_an_alarm_is_acknowledged_with_a_name(site: Site) -> None:
     site.tick(T0, 4, lies={"H3": 9.0})
     page = site.open()
     page.locator("button.ack").click()
-    page.locator("#ack-form .primary").click()  # no name: the form stays
-    expect(page.locator("#ack")).to_be_visible()
-    page.fill("#ack-who", "   ")
-    page.locator("#ack-form .primary").click()
-    expect(page.locator("#ack-error")).to_have_text("Please enter your name.")
-    page.fill("#ack-who", "Ada <b>")
-    page.fill("#ack-comment", "van sent")
-    page.locator("#ack-form .primary").click()
-    expect(page.locator("#ack")).to_be_hidden()
+    page.locator("#act-send").click()  # no name: the form stays
+    expect(page.locator("#act")).to_be_visible()
+    page.fill("#act-who", "   ")
+    page.locator("#act-send").click()
+    expect(page.locator("#act-error")).to_have_text("Please enter your name.")
+    page.fill("#act-who", "Ada <b>")
+    page.fill("#act-text", "van sent")
+    page.locator("#act-send").click()
+    expect(page.locator("#act")).to_be_hidden()
     expect(page.locator(".alarm .answer")).to_have_text("Acknowledged by Ada <b>van sent")
     expect(page.locator("button.ack")).to_have_count(0)
     (alarm,) = site.service.store.alarms()[0]
     assert (alarm.acknowledged_by, alarm.comment) == ("Ada <b>", "van sent")
+
+
+def test_a_single_alarm_is_commented_and_its_acknowledgement_withdrawn(site: Site) -> None:
+    site.service.wall = lambda: T0 + 10
+    site.tick(T0, 4, lies={"H3": 9.0, "H5": 9.0})
+    page = site.open()
+    one = page.locator('#alarm-list .alarm:has-text("H3")')
+    expect(one.locator("button.withdraw")).to_have_count(0)
+    one.locator("button.ack").click()
+    page.fill("#act-who", "Ada")
+    page.click("#act-send")
+    # A known name is not typed again: the cursor stands in the text.
+    one.locator('[data-do="comment"]').click()
+    expect(page.locator("#act-text")).to_be_focused()
+    page.click("#act-send")
+    expect(page.locator("#act")).to_be_visible()
+    page.keyboard.type("fuse <b>changed")
+    page.click("#act-send")
+    one.locator('[data-do="log"]').click()
+    log = one.locator(".log li")
+    expect(log).to_have_count(3)
+    expect(log.last).to_contain_text("comment by Adafuse <b>changed")
+    one.locator("button.withdraw").click()
+    page.fill("#act-text", "wrong house")
+    page.click("#act-send")
+    expect(one.locator("button.ack")).to_be_visible()
+    expect(one).to_have_attribute("data-state", "raised")
+    expect(one.locator("button.ack")).to_be_focused()
+    # The open log follows.
+    expect(log.last).to_contain_text("acknowledgement withdrawn by Adawrong house")
+    found = {alarm.meter: alarm.acknowledged_by for alarm in site.service.store.alarms()[0]}
+    assert found == {"H3": None, "H5": None}
+    # The same actions within the incident.
+    page.locator(".incident .line").click()
+    inside = page.locator('.incident .alarm:has-text("H3")')
+    expect(inside.locator(".log li")).to_have_count(4)
+    inside.locator("button.ack").click()
+    page.click("#act-send")
+    expect(inside.locator("button.withdraw")).to_be_visible()
+    expect(one.locator("button.withdraw")).to_be_visible()
+    inside.locator('[data-do="log"]').click()
+    expect(page.locator(".alarm .log")).to_have_count(0)
 
 
 def test_what_is_learned_of_the_meters_and_a_replaced_one(site: Site) -> None:
@@ -146,14 +188,14 @@ def test_what_is_learned_of_the_meters_and_a_replaced_one(site: Site) -> None:
     expect(panel).to_contain_text("+0.41 V")
     expect(panel).to_contain_text("± 0.09 V, learned on ")
     page.locator("#replaced").click()
-    expect(page.locator("#renew-what")).to_contain_text("Meter H3 of village")
-    page.fill("#renew-who", "Ada <b>")
-    page.fill("#renew-reason", "  ")
-    page.locator("#renew-form .primary").click()
-    expect(page.locator("#renew-error")).to_have_text("Please enter your name and the reason.")
-    page.fill("#renew-reason", "new <i>meter")
-    page.locator("#renew-form .primary").click()
-    expect(page.locator("#renew")).to_be_hidden()
+    expect(page.locator("#act-what")).to_contain_text("Meter H3 of village")
+    page.fill("#act-who", "Ada <b>")
+    page.fill("#act-text", "  ")
+    page.locator("#act-send").click()
+    expect(page.locator("#act-error")).to_have_text("Please enter the reason.")
+    page.fill("#act-text", "new <i>meter")
+    page.locator("#act-send").click()
+    expect(page.locator("#act")).to_be_hidden()
     expect(page.locator("#commissioning")).to_have_text("Learning 1 of 13 meters, 5 of 24 h.")
     expect(panel).to_contain_text("not learned yet 5 of 24 h gathered, learning")
     (event,) = site.service.store.commission_events("village")
@@ -204,13 +246,13 @@ def test_the_second_operator_hears_who_was_first(site: Site) -> None:
     one, two = site.open(), site.open()
     two.locator("button.ack").click()
     one.locator("button.ack").click()
-    one.fill("#ack-who", "Ada")
-    one.locator("#ack-form .primary").click()
+    one.fill("#act-who", "Ada")
+    one.locator("#act-send").click()
     expect(two.locator(".alarm .answer")).to_contain_text("Ada")  # it arrives behind the open dialogue
     site.expected = "409"
-    two.fill("#ack-who", "Grace")
-    two.locator("#ack-form .primary").click()
-    expect(two.locator("#ack-error")).to_contain_text("already been acknowledged by Ada")
+    two.fill("#act-who", "Grace")
+    two.locator("#act-send").click()
+    expect(two.locator("#act-error")).to_contain_text("already been acknowledged by Ada")
 
 
 def test_nobody_answers_an_alarm_that_has_come_back_behind_the_dialogue(site: Site) -> None:
@@ -221,13 +263,13 @@ def test_nobody_answers_an_alarm_that_has_come_back_behind_the_dialogue(site: Si
     site.tick(T0 + 12, 4, lies={"H3": 40.0})
     expect(page.locator(".alarm .times")).to_have_text("× 2")
     site.expected = "409"
-    page.fill("#ack-who", "Ada")
-    page.locator("#ack-form .primary").click()
-    expect(page.locator("#ack-error")).to_contain_text("raised 2 times by now")
+    page.fill("#act-who", "Ada")
+    page.locator("#act-send").click()
+    expect(page.locator("#act-error")).to_contain_text("raised 2 times by now")
     expect(page.locator(".alarm")).to_have_attribute("data-state", "raised")
-    page.locator("#ack-cancel").click()
+    page.locator("#act-cancel").click()
     page.locator("button.ack").click()
-    page.locator("#ack-form .primary").click()
+    page.locator("#act-send").click()
     expect(page.locator(".alarm .answer")).to_contain_text("Ada")
 
 

@@ -11,6 +11,8 @@ import pytest
 from playwright.sync_api import expect
 
 from gridsec.interface import Cause, Decision
+from service.alarms.conditions import AlarmKind
+from service.alarms.incidents import IncidentKind
 from service.api.guide import page as guide
 from service.report.report import BusbarMeterState, DisplayedVerdict, ExplanationReport
 from tests.service.asking import T0
@@ -37,7 +39,7 @@ def test_the_displayed_verdict_and_the_latest_tick(site: Site, size: dict[str, i
     expect(page.locator("#decision")).to_have_text("ATTACKED")
     expect(page.locator("#since")).to_have_text(re.compile(r"^Since .* \(3 min\)\.$"))
     expect(page.locator("#certainty")).to_contain_text("Strongest evidence at this tick: H3, 6.6 times")
-    expect(page.locator("#next a")).to_have_attribute("href", "operator-guide#verdict-attacked")
+    expect(page.locator("#next a")).to_have_attribute("href", "operator-guide#meter-manipulated")
     # A tick without an answer does not change the banner; it is named beside it.
     shown(site, T0 + 1, attacked, silent=("H5",))
     expect(page.locator("#since")).to_contain_text("Latest tick: undecided, silent meters.")
@@ -109,12 +111,26 @@ def test_without_a_connection_the_page_is_dimmed_and_states_it(site: Site, schem
     assert main.evaluate("e => getComputedStyle(e, '::after').content") == "none"
 
 
-def test_every_next_step_leads_to_a_section_of_the_guide(site: Site) -> None:
+def test_every_kind_and_every_cause_has_a_section_of_the_guide(site: Site) -> None:
     sections = set(re.findall(r'<h\d id="([^"]+)">', guide()))
-    steps = BANNER.read_text(encoding="utf-8").partition("const STEPS")[2].partition("};")[0]
+    code = BANNER.read_text(encoding="utf-8")
+    steps = code.partition("const STEPS")[2].partition("};")[0]
     wanted = set(re.findall(r', "([a-z-]+)"\],', steps))
     assert len(wanted) >= 5
     assert wanted <= sections
+    assert {*AlarmKind, *IncidentKind, "undecided"} <= sections
+    causes = set(
+        re.findall(r'^  "?([a-z-]+)"?: "', code.partition("const CAUSES")[2].partition("};")[0], re.M)
+    )
+    assert {*Cause} - {Cause.AGREEMENT, Cause.RESIDUALS} <= causes
+    assert {f"undecided-{cause}" for cause in causes} <= sections
+    # The links of the page.
+    site.tick(T0, 4, lies={"H3": 9.0})
+    seen = site.open()
+    expect(seen.locator("#next a")).to_have_attribute("href", "operator-guide#meter-manipulated")
+    seen.locator(".incident .line").click()
+    for place, kind in ((".incident .body > .tools", "manipulation"), ("#alarm-list", "meter-manipulated")):
+        expect(seen.locator(f"{place} .guide-link")).to_have_attribute("href", f"operator-guide#{kind}")
     site.tick(T0)
     page = site.open(path="/operator-guide#verdict-undecided")
     expect(page.locator("#verdict-undecided")).to_be_in_viewport()

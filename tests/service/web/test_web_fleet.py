@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -31,7 +32,8 @@ def tick(site: Site, village: Any, t: float, **changes: Any) -> None:
     site.service.tick(village.report(t, **changes))
 
 
-@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+@pytest.mark.canary("phone")
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 def test_the_worst_feeder_comes_first(
     site_of: Callable[..., Site], village: Callable[..., Any], size: dict[str, int]
 ) -> None:
@@ -74,6 +76,51 @@ def test_one_feeder_has_no_list(site: Site) -> None:
     page = site.open()
     expect(page.locator("#decision")).to_have_text("CLEAN")
     expect(page.locator("#fleet")).to_be_hidden()
+
+
+@pytest.mark.canary("phone-dark")
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_feeders_that_are_not_evaluated_never_look_clean(
+    site_of: Callable[..., Site], village: Callable[..., Any], size: dict[str, int], scheme: str
+) -> None:
+    """One is shed, as the engine reports it; one has no owner, as the front of workers reports it."""
+    quiet, shed, lost = (village(name, 4) for name in ("a-quiet", "b-shed", "c-lost"))
+    site = site_of(quiet, shed, lost)
+    site.expected = "503"
+    tick(site, quiet, T0)
+    tick(site, lost, T0)
+    blind = shed.report(T0, cause=Cause.OVERLOAD)
+    unseen = {"seen": False, "model_only": True, "v_volt_reported": None, "score": None}
+    meters = tuple(replace(meter, **unseen) for meter in blind.meters)
+    site.service.tick(replace(blind, meters=meters, model_only=True))
+    plain = site.service.summary
+    gone = {"cause": "no-owner", "verdict": "undecided", "displayed_verdict": "undecided", "since": None}
+    site.service.summary = lambda name: {**plain(name), **(gone if name == "c-lost" else {})}
+    page = site.open(size, "/#b-shed", color_scheme=scheme)
+    expect(page.locator("#decision")).to_have_text("SHED")
+    expect(page.locator("#link")).to_have_text("not evaluated")
+    expect(page.locator("#next a")).to_have_attribute("href", "operator-guide#undecided-overload")
+    expect(page).to_have_title("SHED – B-shed, 4 customers – gridsec")
+    expect(page.locator("#fleet-counts")).to_have_text("2 undecided: 1 shed, 1 no owner1 clean")
+    words = page.locator("#fleet-rows .fleet-state")
+    expect(words).to_have_text(["SHED", "NO OWNER", "CLEAN"])
+    looks = words.evaluate_all(
+        "all => all.map(e => [getComputedStyle(e).color, getComputedStyle(e, '::before').content])"
+    )
+    assert looks[0] == looks[1]
+    assert looks[0][0] != looks[2][0]
+    assert looks[0][1] != looks[2][1]
+    page.wait_for_timeout(1200)  # twice the interval of the freshness
+    expect(page.locator("#decision")).to_have_text("SHED")
+    expect(page.locator("#diagram .customer[data-status=ok]")).to_have_count(0)
+    detail = {"status": 503, "code": "no-owner", "detail": "no worker monitors feeder 'c-lost' at the moment"}
+    page.route("**/feeders/c-lost", lambda route: route.fulfill(status=503, json=detail))
+    page.locator("#fleet-rows button:has-text('C-lost')").click()
+    expect(page.locator("#decision")).to_have_text("NO OWNER")
+    expect(page.locator("#reason")).to_contain_text("no worker monitors feeder")
+    expect(page.locator("#next a")).to_have_attribute("href", "operator-guide#undecided-no-owner")
+    assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
 
 
 @pytest.mark.acceptance
@@ -133,8 +180,8 @@ def test_numbers_by_verdict_filter_the_list(
     expect(first.locator("td").nth(4)).to_have_text("2, 2 new")
     expect(second.locator("td").nth(3)).to_have_text("25 %")
     page.locator('.alarm:has-text("H1") button.ack').click()
-    page.fill("#ack-who", "Ada")
-    page.locator("#ack-form .primary").click()
+    page.fill("#act-who", "Ada")
+    page.locator("#act-send").click()
     expect(first.locator("td").nth(4)).to_have_text("2, 1 new")
     undecided = page.locator('#fleet-counts button[data-state="undecided"]')
     undecided.click()

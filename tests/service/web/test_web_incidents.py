@@ -110,7 +110,7 @@ def test_pictures_of_incidents_and_hand_over(
     shelved.locator(".line").click()
     shelved.get_by_role("button", name="Shelve").click()
     fill(page, "meter is exchanged on Monday")
-    shelved.get_by_role("button", name="Comment").click()
+    shelved.locator('[data-act="comment"]').click()
     fill(page, "customer informed")
     expect(shelved.locator(".log")).to_contain_text("customer informed")
     fits(page, size)

@@ -17,7 +17,8 @@ from tests.service.running import FEEDER, service
 pytestmark = pytest.mark.browser
 
 
-@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+@pytest.mark.canary("phone")
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 def test_the_page_asks_for_a_key_and_shows_the_identity(
     browser: Browser, tmp_path: Path, size: dict[str, int]
 ) -> None:

@@ -83,7 +83,8 @@ def heights(page: Page, panel: int, kind: str) -> list[float]:
 
 def chosen_time(page: Page) -> tuple[float, float | None]:
     """Span and end of the address."""
-    found = dict(part.split("=") for part in page.url.partition("?")[2].split("&"))
+    address = page.evaluate("location.href")
+    found = dict(part.split("=") for part in address.partition("?")[2].split("&"))
     return float(found["span"]), float(found["until"]) if "until" in found else None
 
 
@@ -200,6 +201,62 @@ def test_zoom_by_pointer_and_keyboard(opened: Callable[..., Page], live: tuple[I
     page.locator(f"#chips .chip:has-text('{meters[LIAR]}')").click()
     page.locator("#detail-series").click()
     expect(page.locator("#series-meters .chip")).to_contain_text(meters[LIAR])
+
+
+def test_two_fingers_zoom_and_move_and_a_touchpad_does(site: Site) -> None:
+    site.tick(T0, 30)
+    page = site.open(PHONE, "/#village?series=H3&span=3600&until=1795212000", has_touch=True)
+    expect(page.locator("#series-chart .panel")).to_have_count(1)
+    page.locator("#series-chart").scroll_into_view_if_needed()
+    frame = page.locator("#series-chart .frame").bounding_box()
+    assert frame is not None
+    left, width, y = frame["x"], frame["width"], frame["y"] + 0.5 * frame["height"]
+    session = page.context.new_cdp_session(page)
+
+    def touch(kind: str, *points: tuple[float, float]) -> None:
+        at = [{"x": x, "y": up, "id": k} for k, (x, up) in enumerate(points)]
+        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": at})
+
+    def two(apart: tuple[float, ...], middle: tuple[float, ...], slant: float = 0.0) -> None:
+        """Shares of the width; `slant` moves one finger down, px."""
+        for k, (d, m) in enumerate(zip(apart, middle, strict=True)):
+            places = [(left + (m - 0.5 * d) * width, y), (left + (m + 0.5 * d) * width, y + slant)]
+            touch("touchMove" if k else "touchStart", *places)
+        touch("touchEnd")
+
+    # Twice the distance halves the span, and the time at the middle of the fingers stays there.
+    two((0.2, 0.3, 0.4), (0.25, 0.25, 0.25))
+    span, end = chosen_time(page)
+    assert span == pytest.approx(1800.0, rel=0.02)
+    assert (end or 0.0) - 0.75 * span == pytest.approx(T0 - 2700.0, abs=30.0)
+    # Two fingers side by side move the chart, upright ones too; one finger up or down does nothing.
+    two((0.3, 0.3, 0.3), (0.5, 0.6, 0.75))
+    moved, after = chosen_time(page)
+    assert moved == pytest.approx(span, rel=0.02)
+    assert (end or 0.0) - (after or 0.0) == pytest.approx(0.25 * span, rel=0.05)
+    two((0.0, 0.0), (0.5, 0.4), slant=60.0)
+    assert (chosen_time(page)[1] or 0.0) - (after or 0.0) == pytest.approx(0.1 * span, rel=0.1)
+    before = chosen_time(page)
+    touch("touchStart", (left + 50, y))
+    touch("touchMove", (left + 50, y + 40))
+    touch("touchEnd")
+    assert chosen_time(page) == before
+    # Not beyond the present; the pinch of a touchpad is a wheel with Ctrl.
+    page.locator("#series-chart").focus()
+    page.keyboard.press("0")
+    assert chosen_time(page)[1] is None
+    page.mouse.move(left + 0.5 * width, y)
+    page.keyboard.down("Control")
+    page.mouse.wheel(0, -60)
+    page.keyboard.up("Control")
+    expect(page).not_to_have_url(re.compile("span=3600"))
+    span, end = chosen_time(page)
+    assert 1500.0 < span < 2500.0
+    page.mouse.wheel(-64, 0)
+    expect(page).not_to_have_url(re.compile(rf"until={end:.0f}$"))
+    assert chosen_time(page)[0] == pytest.approx(span, rel=0.02)
+    assert (end or 0.0) - (chosen_time(page)[1] or 0.0) == pytest.approx(0.25 * span, rel=0.05)
+    assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
 
 
 def test_a_choice_that_does_not_exist_is_left_out(site: Site) -> None:
