@@ -463,10 +463,15 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     plain = estimates.honest(made, by, state.filter, state.static, state.update)
     if suspicion is None:
         return plain
-    now = _joint(core, _parts(state), suspicion.row)
-    before, T = [plain], [estimates.moves(made, by, state.filter, now, core.faults.W, core.effect)]
+    found, before, T = suspicion.found, [plain], list[Floats]()
     for each in state.rivals[1:]:
         update = each.update or state.update
         before.append(estimates.honest(each.modes, by, each.filter, each.static, update, loads=each.loads))
-        T.append(estimates.moves(each.modes, by, each.filter, each.joint(), core.faults.W, core.effect))
-    return estimates.corrected(before, T, suspicion.found)
+    for model, filtered in enumerate((state.filter, *(each.filter for each in state.rivals[1:]))):
+        used, moved = found.chosen[found.model == model].any(axis=0), np.zeros_like(core.effect)
+        if used.any():
+            joint = state.rivals[model].joint() if model else _joint(core, _parts(state), suspicion.row)
+            W, effect = core.faults.W[:, used], core.effect[:, used]
+            moved[:, used] = estimates.moves(made, by, filtered, joint, W, effect)
+        T.append(moved)
+    return estimates.corrected(before, T, found)

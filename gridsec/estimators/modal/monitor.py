@@ -20,7 +20,7 @@ meter is named likewise; its phase then counts as not metered, until the meters 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -30,6 +30,7 @@ from gridsec.estimators.modal import core, detector, doubts, full, masking, reco
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.doubts import Unknown
+from gridsec.estimators.modal.estimate import Estimated, Reconstructed
 from gridsec.estimators.modal.record import Record
 from gridsec.estimators.modal.replay import History
 from gridsec.estimators.modal.search import DOUBT
@@ -67,7 +68,7 @@ from gridsec.estimators.sequential.meter_bias import (
     ready_meters,
     usable,
 )
-from gridsec.estimators.sequential.output import BoundedEstimate, BoundInputs
+from gridsec.estimators.sequential.output import BoundInputs
 from gridsec.estimators.sequential.posterior import UNMETERED, LoadDoubt
 from gridsec.estimators.sequential.state import Prediction, SequentialState, SuspicionRecord
 from gridsec.estimators.sequential.step import predict
@@ -431,8 +432,8 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
     named, seen = kernel.masked.meters, tick.measured.available
     suspected = any_of(kernel.detector.pinned)
     trust = _trust(design, now, named, state.suspicion)
-    estimate, of_busbar = _estimate(design, replace(state, front=trust), tick)
-    busbar = _busbar(design, now, tick, estimate, of_busbar)
+    estimate, spread = _estimate(design, replace(state, front=trust), tick)
+    busbar = _busbar(design, now, tick, estimate, spread)
     evidence = verdict.meter_evidence(
         design.core, kernel, tick.evidence, (tick.m, seen), front.options.widest, state.suspicion
     )
@@ -525,24 +526,25 @@ def _settled(front: SequentialDesign, predicted: Prediction) -> bool:
 
 
 def _busbar(
-    design: ModalDesign, now: SequentialState, tick: _Tick, estimate: Estimate, variance: Floats
+    design: ModalDesign, now: SequentialState, tick: _Tick, estimate: Estimate, spread: Callable[[], Floats]
 ) -> BusbarTrust:
     """Trust of the busbar's meter: a named phase is compared with the estimate until both agree."""
     if all_of(now.busbar.trusted):
         return now.busbar
     measured, front = tick.measured, design.front
+    first = front.plant.feeder.busbar_places()
+    v0_squared, variance = estimate.v2_bus[first], np.atleast_1d(spread()[first])
     there = measured.busbar_available & np.isfinite(variance)
-    v0_squared = estimate.v2_bus[front.plant.feeder.busbar_places()]
     allowed = float(front.allowed.max())
     return track_busbar(front, now.busbar, measured.busbar_reading, there, v0_squared, variance, allowed)
 
 
-def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Estimate, Floats]:
-    """Voltages by the model and the core, with standard deviation and bound; variance at the busbar, (b,)."""
+def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Estimate, Callable[[], Floats]]:
+    """Voltages by the model and the core, with standard deviation and bound; the core's variance, (n,)."""
     front, kernel, measured = design.front, design.core, tick.measured
     plant, now = front.plant, state.front
     errors = core.estimate(kernel, state.core, state.suspicion)
-    mean, variance = errors.mean, errors.variance
+    mean, spread = errors.mean, _Spread(errors)
     whole = state.core.filter.full
     if tick.unknown is not None and whole is not None:
         u, read = tick.m - whole.mean[0] - whole.mean[1], whole.seen
@@ -552,11 +554,9 @@ def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Esti
             u = u - (mean - plain.mean)[front.prior.meters]
             read = read & ~verdict.accused(kernel, state.suspicion)
         more = doubts.estimated(kernel.modes, tick.unknown, u, read)
-        mean, variance = mean + more[0], variance + more[1]
+        mean, spread = mean + more[0], _Spread(errors, more[1])
     v2_bus, first = tick.predicted.v2_bus + mean, plant.feeder.busbar_places()
     v2_bus[first] = np.where(measured.busbar_metered, measured.v0_squared, v2_bus[first])
-    variance, of_busbar = variance.copy(), variance[first].copy()
-    variance[first] = np.maximum(variance[first], np.where(measured.busbar_metered, front.busbar**2, 0.0))
     # While the readings disagree and no search has settled it, no reading bounds a voltage.
     sure = now.trust.trusted & measured.available & (not any_of(state.core.detector.pinned))
     inputs = BoundInputs(
@@ -570,8 +570,24 @@ def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Esti
         checked=_Checked(front, measured.frame),
         sigmas=front.sigmas[0],
     )
-    made = BoundedEstimate.of(inputs, measured.frame.t, v2_bus, variance, tick.predicted.x)
-    return made, np.atleast_1d(of_busbar)
+    least = replace(spread, places=first, least=np.where(measured.busbar_metered, front.busbar**2, 0.0))
+    return Reconstructed.later(inputs, measured.frame.t, v2_bus, least, tick.predicted.x), spread
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Spread:
+    """Variance of the voltages at all places, (n,), evaluated where asked for."""
+
+    errors: Estimated
+    more: Floats | float = 0.0  # of unknown directions
+    places: slice | None = None  # busbar
+    least: Floats | float = 0.0  # at `places`
+
+    def __call__(self) -> Floats:
+        out = self.errors.variance + self.more
+        if self.places is not None:
+            out[self.places] = np.maximum(out[self.places], self.least)
+        return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -617,7 +633,7 @@ def _kinds(
     references, meters = front.references, front.plant.meters
     own = np.asarray(references.active * measured.frame.p[meters] + references.reactive * measured.q[meters])
     expected = estimate.v2_bus[front.prior.meters]
-    variance = np.maximum(estimate.std[meters] ** 2 + front.white, front.white)
+    variance = front.white
     if any_of(named):
         expected = expected + own_errors(design, kernel)
         variance = verdict.deviations(design.core, kernel, tick.m)[1] ** 2
