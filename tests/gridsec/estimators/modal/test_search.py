@@ -81,10 +81,18 @@ def test_costs_changes_and_exchanges_are_exact(seed: int) -> None:
         if free.size:
             other = tableau.chosen.copy()
             other[free] = True
-            change = tableau.group(np.arange(given.meters)[None], other[None, : given.meters])
-            same = free.size > 1
-            assert not same or tableau.cost + change[0] == pytest.approx(s.cost(given, other), abs=1e-7)
-            assert same or np.isinf(change[0])
+            change = tableau.group(np.arange(given.meters)[None], other[None, : given.meters])[0]
+            for n, found in enumerate(change):
+                some = np.append(other[: n + 1], np.zeros(other.size - n - 1, dtype=np.bool_))
+                some |= tableau.chosen
+                several = np.count_nonzero(some & ~tableau.chosen) > 1
+                assert not several or tableau.cost + found == pytest.approx(s.cost(given, some), abs=1e-7)
+                assert several or np.isinf(found)
+    some = random.random((5, given.meters)) < 0.5
+    changes = tableau.toggled(np.tile(np.arange(given.meters), (5, 1)), some)
+    for each, change in zip(some, changes, strict=True):
+        other = tableau.chosen ^ np.append(each, np.zeros(given.y.size - given.meters, dtype=np.bool_))
+        assert tableau.cost + change == pytest.approx(s.cost(given, other), abs=1e-7)
     assert np.isfinite(tableau.A).all()
     again = Tableau(given).pivot(tableau.chosen)
     assert np.allclose(again.A, tableau.A, atol=1e-8 * np.abs(tableau.A).max())
@@ -203,6 +211,20 @@ def test_amounts_that_become_impossible_are_removed() -> None:
     end = s.descend(tableau)
     amount = s.amounts(tight, end.chosen)[0]
     assert (np.abs(amount) <= tight.bound[end.chosen]).all()
+
+
+def test_sequences_contain_every_group_once() -> None:
+    """Nested groups, and groups that overlap: each is the beginning of one sequence."""
+    made = modes(busbar())
+    for some in (s.groups(made), (np.array([1, 2, 3]), np.array([2, 3, 4]), np.array([2, 3])), ()):
+        found = [
+            frozenset(members[k, : n + 1].tolist())
+            for members, inside, ends in s.together(some)
+            for k, n in zip(*np.nonzero(ends), strict=True)
+            if inside[k, : n + 1].all()
+        ]
+        assert len(found) == len(some)
+        assert set(found) == {frozenset(each.tolist()) for each in some}
 
 
 def test_groups_are_nested_and_cover_neighbours() -> None:
