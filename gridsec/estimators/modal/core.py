@@ -14,6 +14,7 @@ loss-corrected power flow. `residuals` reads the residuals that it leaves.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from math import inf, log
 
@@ -277,22 +278,54 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
         The explanations after the same tick.
     """
     named, history = suspicion.found.named, state.history
-    before, known, test, _ = history.start
     first = len(history.readings) - int(state.detector.onsets.age[suspicion.row])
+    begun = None
     if first < 0:
-        begun = _joint(core, history.start, suspicion.row)
+        before, known, *_ = history.start
+        joint = _joint(core, history.start, suspicion.row)
         whole = before.full or full.expanded(core.modes, before, known)
         W = core.faults.W[:, : named.size][:, named]
-        before = replace(before, full=replay.freed(core.modes, whole, begun, W, np.ones(W.shape[1])))
-        test = detector.start(core.modes)
-    test = detector.pin(test, np.zeros(0, np.intp))
-    parts = before, known, test
-    now = CoreState(*parts, None, History((*parts, ())), (), masking.none(core.modes))
-    evidence = Evidence(-inf, np.full(test.capital.shape, -inf))
-    for k, (t, m, seen, unknown) in enumerate(history.readings):
-        read = seen if k < first else ~named if seen is None else seen & ~named
-        now, evidence = step(core, now, t, m, read, unknown)
+        begun = replace(before, full=replay.freed(core.modes, whole, joint, W, np.ones(W.shape[1])))
+
+    def masked(k: int, seen: Bools | None, unknown: Floats | None) -> tuple[Bools | None, Floats | None]:
+        return seen if k < first else ~named if seen is None else seen & ~named, unknown
+
+    now, evidence = again(core, history, first, masked, begun)
     return replace(now, masked=masking.added(state.masked, named)), evidence
+
+
+def again(
+    core: Core,
+    history: History,
+    first: int,
+    change: Callable[[int, Bools | None, Floats | None], tuple[Bools | None, Floats | None]],
+    begun: FilterState | None = None,
+) -> tuple[CoreState, Evidence]:
+    """Replay of kept readings with others in place of some, without a pinned onset; no meter is masked.
+
+    Parameters
+    ----------
+    core, history
+        The core, and the readings.
+    first
+        Number of the first reading that changes; negative: before all that are kept. The detector then starts
+        anew.
+    change
+        Meters with a reading and unknown directions of a tick, by its number and those that are kept.
+    begun
+        Filter before the first kept reading; None: as it was.
+    """
+    kept, (before, known, test, _) = history.until(max(0, first))
+    if first < 0:
+        before, test = begun or before, detector.start(core.modes)
+        kept = History((before, known, test, ()))
+    test = detector.pin(test, np.zeros(0, np.intp))
+    now = CoreState(before, known, test, None, kept, (), masking.none(core.modes))
+    evidence = Evidence(-inf, np.full(test.capital.shape, -inf))
+    for k in range(len(kept.readings), len(history.readings)):
+        t, m, seen, unknown = history.readings[k]
+        now, evidence = step(core, now, t, m, *change(k, seen, unknown))
+    return now, evidence
 
 
 def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:

@@ -26,13 +26,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, changed
-from gridsec.estimators.modal import core, detector, doubts, full, masking, record, verdict
+from gridsec.estimators.modal import core, doubts, full, masking, record, verdict
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.doubts import Unknown
 from gridsec.estimators.modal.estimate import Estimated, Reconstructed
 from gridsec.estimators.modal.record import Record
-from gridsec.estimators.modal.replay import History
 from gridsec.estimators.modal.search import DOUBT
 from gridsec.estimators.plant import Plant, nothing_new
 from gridsec.estimators.sequential import design as front_design
@@ -383,22 +382,13 @@ def _without_busbar(
     named = np.zeros(H.shape[1], dtype=np.bool_)
     named[H.any(axis=0)] = which
     columns = doubts.WIDER * UNMETERED * H[:, named]
-    before, known, test, _ = kernel.history.start
     first = len(kernel.history.readings) - int(kernel.detector.onsets.age[suspicion.row])
-    if first < 0:
-        test = detector.start(modes)
-    parts = before, known, detector.pin(test, np.zeros(0, np.intp)), ()
-    now = replace(
-        core.init(design.core, before.t),
-        filter=before,
-        static=known,
-        detector=parts[2],
-        history=History(parts),
-    )
-    evidence = Evidence(-np.inf, np.full(test.capital.shape, -np.inf))
-    for k, (t, m, seen, unknown) in enumerate(kernel.history.readings):
-        more = unknown if k < first else columns if unknown is None else np.hstack([unknown, columns])
-        now, evidence = core.step(design.core, now, t, m, seen, more)
+
+    def unmetered(k: int, seen: Bools | None, unknown: Floats | None) -> tuple[Bools | None, Floats | None]:
+        more = columns if unknown is None else np.hstack([unknown, columns])
+        return seen, unknown if k < first else more
+
+    now, evidence = core.again(design.core, kernel.history, first, unmetered)
     after = replace(
         state,
         front=changed(state.front, busbar=_suspected_busbar(front, state.front.busbar, named)),
