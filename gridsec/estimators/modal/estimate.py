@@ -31,7 +31,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, indices, submatrix
 from gridsec.estimators.modal.filter import FilterState, Full, Update
 from gridsec.estimators.modal.model import Modes
-from gridsec.estimators.modal.search import Identification, SearchProblem, amounts
+from gridsec.estimators.modal.search import Identification, SearchProblem, amounts, mean_amounts
 from gridsec.estimators.modal.signatures import Joint
 from gridsec.estimators.modal.static import Static
 from gridsec.estimators.sequential.output import PENDING, BoundedEstimate, BoundInputs
@@ -224,11 +224,13 @@ def _one(before: Estimated, T: Floats, problem: SearchProblem, chosen: Bools) ->
     at = np.flatnonzero(chosen)
     if not at.size:
         return before
-    mean, cov = amounts(problem, chosen)
     moved = T[:, at]
-    return Estimated(
-        before.mean + moved @ mean, lambda: before.variance + ((moved @ cov) * moved).sum(axis=1)
-    )
+
+    def spread() -> Floats:
+        more = ((moved @ amounts(problem, chosen)[1]) * moved).sum(axis=1)
+        return np.asarray(before.variance + more)
+
+    return Estimated(before.mean + moved @ mean_amounts(problem, chosen), spread)
 
 
 class Reconstructed(BoundedEstimate):

@@ -260,6 +260,14 @@ def amounts(problem: SearchProblem, chosen: Bools) -> tuple[Floats, Floats]:
     return cov @ problem.y[at], cov
 
 
+def mean_amounts(problem: SearchProblem, chosen: Bools) -> Floats:
+    """Posterior mean of the amounts of a set, (k,): a third of the time of `amounts`."""
+    at = np.flatnonzero(chosen)
+    A = problem.F[np.ix_(at, at)]
+    A[np.diag_indices(at.size)] += problem.std[at] ** -2.0
+    return np.asarray(lapack.dposv(A, problem.y[at], lower=True)[1])
+
+
 class Tableau:
     """Sweep tableau of one problem, pivoted on a set.
 
