@@ -128,19 +128,20 @@ def honest(
         w, b = state.full.mean @ modes.U
         mean = made.of_w @ w + made.of_b @ b + made.of_e @ static.score
         return Estimated(mean, partial(_full_variance, modes, made, state.full, more))
-    w, b = state.mean
-    mean = made.of_w @ w + made.of_b @ b + made.of_e @ (update.innovation / update.variance)
-    moved = _theta(modes, made, static)
+    w, b, e = *state.mean, update.innovation / update.variance
     if modes.sign.size:
-        mean += moved @ static.theta
-    return Estimated(mean, partial(_variance, made, state.cov, moved, static.cov, more))
+        (g_w, g_b), known = static.signature, modes.directions @ static.theta
+        w, b, e = w - g_w * known, b + (1.0 - g_b) * known, e - (1.0 - g_w - g_b) * known
+    mean = made.of_w @ w + made.of_b @ b + made.of_e @ e
+    return Estimated(mean, partial(_variance, modes, made, state.cov, static, more))
 
 
-def _variance(made: Estimator, cov: Floats, moved: Floats, of_theta: Floats, more: Floats) -> Floats:
-    """Variance by the covariance of the modes (3, t) and of the directions (r, r), (n,)."""
+def _variance(modes: Modes, made: Estimator, cov: Floats, static: Static, more: Floats) -> Floats:
+    """Variance by the covariance of the modes (3, t) and of the directions, (n,)."""
+    moved = _theta(modes, made, static)
     by_w, by_b = made.of_w - made.of_e, made.of_b - made.of_e
     out = (by_w * by_w) @ cov[0] + (by_b * by_b) @ cov[2] + 2.0 * ((by_w * by_b) @ cov[1])
-    out += made.rest + more + ((moved @ of_theta) * moved).sum(axis=1)
+    out += made.rest + more + ((moved @ static.cov) * moved).sum(axis=1)
     return np.asarray(np.maximum(out, 0.0))
 
 

@@ -48,6 +48,10 @@ class Full:
         As ``cov`` of `FilterState`, of the readings that were there, with its diagonal kept at every tick.
     complete
         Ticks with all readings since the last one without, or since the last attempt to return.
+    share : (t,) or None
+        Part of each mode's information that was read; None where all readings are there.
+    since
+        Ticks since ``share`` was computed.
     """
 
     mean: Floats
@@ -55,6 +59,8 @@ class Full:
     seen: Bools
     kept: Floats
     complete: int
+    share: Floats | None = field(default=None, repr=False)
+    since: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

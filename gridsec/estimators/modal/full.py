@@ -49,6 +49,8 @@ from gridsec.estimators.modal.static import Static
 
 COMPLETE = 64
 """Ticks with all readings before a return to the modes, and from one attempt to the next."""
+SHARED = 16
+"""Ticks for which the gain of the signatures is scaled alike while the same members report."""
 MARGIN = 0.1
 """Enlargement of the variance at the return, 1: standard deviations are too large by 5 % at first."""
 
@@ -95,10 +97,13 @@ def step(  # noqa: PLR0917  # the states of both parts, and one tick
     after, update = modal.step(modes, state, t, m, seen)
     if state.full is not None:
         full, innovation = updated(modes, state.full, t - state.t, m, None if whole else seen, unknown)
-        sigma, _ = lapack.dtrtrs(innovation.half, innovation.white, lower=True, trans=1)
-        score = sigma @ modes.back[innovation.rows]
-        kept, slower = _kept(modes, full.kept, update)
-        after = replace(after, full=replace(full, kept=kept))
+        score = np.zeros(modes.size)
+        if innovation.rows.size:
+            sigma, _ = lapack.dtrtrs(innovation.half, innovation.white, lower=True, trans=1)
+            score = sigma @ modes.back[innovation.rows]
+        share, since = _share(modes, state.full, update)
+        kept, slower = _kept(modes, full.kept, update, share)
+        after = replace(after, full=replace(full, kept=kept, share=share, since=since))
         update = replace(update, slower=slower, exact=innovation, score=score)
     return after, static.follow(modes, known, update), update
 
@@ -204,25 +209,33 @@ def expected(modes: Modes, before: Full, h: float, rows: Ints) -> Floats:
     return V
 
 
-def _kept(modes: Modes, kept: Floats, update: Update) -> tuple[Floats, Floats]:
-    """Diagonal covariance after one tick, (3, t), and its gain, (2, t).
-
-    The gain of complete readings is multiplied by the part of each mode's information that was read,
-    ``1 - diag(U_g' (A_gg)^-1 U_g) / v``, with ``A = U diag(1 / v) U'`` and g the members without a reading.
-    """
+def _kept(modes: Modes, kept: Floats, update: Update, share: Floats | None) -> tuple[Floats, Floats]:
+    """Diagonal covariance after one tick, (3, t), and its gain, (2, t), times the share that was read."""
     cov, shared, v = modal.predicted(modes, kept, *update.decay)
     gain = shared / v
-    if update.seen is not None:
-        g = indices(~update.seen)
-        U = modes.U[g]
-        if g.size == modes.size:
-            return cov, 0.0 * gain
-        half, _ = lapack.dpotrf((U / v) @ U.T, lower=True, clean=True)
-        spread, _ = lapack.dtrtrs(half, U, lower=True)
-        gain = gain * np.clip(1.0 - (spread * spread).sum(axis=0) / v, 0.0, 1.0)
+    if share is not None:
+        gain *= share
     cov[:2] -= gain * shared[0]
     cov[2] -= gain[1] * shared[1]
     return cov, gain
+
+
+def _share(modes: Modes, before: Full, update: Update) -> tuple[Floats | None, int]:
+    """Part of each mode's information that was read, (t,), and its age, ticks.
+
+    It is ``1 - diag(U_g' (A_gg)^-1 U_g) / v``, ``A = U diag(1 / v) U'``, g the members without a reading.
+    While the same members report it changes slowly, and is taken over for `SHARED` ticks.
+    """
+    if update.seen is None:
+        return None, 0
+    if before.share is not None and before.since < SHARED and np.array_equal(before.seen, update.seen):
+        return before.share, before.since + 1
+    g, v = indices(~update.seen), modal.predicted(modes, before.kept, *update.decay)[2]
+    if g.size == modes.size:
+        return np.zeros(modes.size), 0
+    half, _ = lapack.dpotrf((modes.U[g] / v) @ modes.U[g].T, lower=True, clean=True)
+    spread, _ = lapack.dtrtrs(half, modes.U[g], lower=True)
+    return np.clip(1.0 - (spread * spread).sum(axis=0) / v, 0.0, 1.0), 0
 
 
 def _returned(modes: Modes, state: FilterState, full: Full, known: Static) -> tuple[FilterState, Static]:

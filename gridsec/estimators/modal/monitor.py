@@ -292,10 +292,15 @@ def _driven(
     if kernel.update is None or not front.meter_of.size or given.x is None:
         return given, measured, predicted
     m = measured.y - predicted.v2_bus[front.prior.meters]
-    off, std = verdict.deviations(design.core, kernel, m)
     drives = np.zeros(m.size, dtype=np.bool_)
     drives[front.meter_of[front.meter_of >= 0]] = True
-    jumps = drives & measured.available & given.trust.trusted & (np.abs(off) > JUMP * std)
+    drives &= measured.available & given.trust.trusted
+    # The variance is at least that of the white errors.
+    far = np.abs(verdict.offsets(design.core, kernel, m)) > JUMP * np.sqrt(design.core.modes.noise.diagonal())
+    if not any_of(drives & far):
+        return given, measured, predicted
+    off, std = verdict.deviations(design.core, kernel, m)
+    jumps = drives & (np.abs(off) > JUMP * std)
     if not 0 < np.count_nonzero(jumps) <= design.max_attacked:
         # Where most readings jump, the busbar's or the loads have; then no inverter can do without them.
         return given, measured, predicted
