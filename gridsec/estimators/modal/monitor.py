@@ -671,7 +671,7 @@ def _errors(design: ModalDesign, state: ModalState, done: Bools) -> Learned:
     """Fixed errors of the filter, for the meters `done` (p,)."""
     front, modes, known, kernel = design.front, design.core.modes, state.front.learned, state.core
     whole = kernel.filter.full or full.expanded(modes, kernel.filter, kernel.static)
-    B, P = modes.covariance_b, whole.cov[modes.size :, modes.size :]
+    B, P = modes.covariance_b, whole.blocks[2]
     fixed = design.core.model.fixed
     variance = np.clip(fixed - ((design.own @ (B - P)) * design.own).sum(axis=1), 0.0, front.fixed)
     aging = front.options.stability * (front.allowed - front.rounded)
@@ -708,7 +708,7 @@ def renew(design: ModalDesign, state: ModalState, which: Bools) -> ModalState:
     cov[np.ix_(t + at, t + at)] += 2.0 * np.diag(fixed) - K @ modes.covariance_b @ K.T
     mean = (A @ whole.mean.ravel()).reshape(2, t)
     blank = core.init(design.core, kernel.filter.t)
-    opened = replace(kernel.filter, full=replace(whole, mean=mean, cov=cov, complete=0))
+    opened = replace(kernel.filter, full=replace(whole.changed(mean, cov), complete=0))
     parts = opened, kernel.static, blank.detector
     masked = masking.Masked(
         kernel.masked.meters & ~which,

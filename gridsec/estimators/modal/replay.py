@@ -244,4 +244,4 @@ def freed(  # the filter, and the faults
     if loads:
         X[: modes.size] -= joint.level * (modes.back @ W)
     gain = np.linalg.solve(F + np.diag(std**-2.0), X.T).T
-    return replace(full, mean=full.mean - (gain @ y).reshape(2, -1), cov=full.cov + gain @ X.T)
+    return full.changed(full.mean - (gain @ y).reshape(2, -1), full.cov + gain @ X.T)

@@ -281,7 +281,6 @@ def _jumped(modes: Modes, state: FilterState, h: float, size: float) -> FilterSt
     cov, full = state.cov.copy(), state.full
     cov[0] += more * (1.0 - modes.model.lasting) * modes.loads
     if full is not None:
-        t, P = modes.size, full.cov.copy()
-        P[:t, :t] += more * modes.jumps
-        full = replace(full, cov=P)
+        w, both, b = full.blocks
+        full = replace(full, blocks=(w + more * modes.jumps, both, b))
     return replace(state, cov=cov, full=full)

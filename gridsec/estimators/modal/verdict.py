@@ -134,15 +134,13 @@ def deviations(core: Core, state: CoreState, m: Floats) -> tuple[Floats, Floats]
     m : (p,)
         Residuals.
     """
-    full, made, t = state.filter.full, core.modes, core.modes.size
+    full, made = state.filter.full, core.modes
     if full is None:
         spread, P = _spread(core, state), state.filter.cov
         variance = (made.back * made.back) @ (P[0] + 2.0 * P[1] + P[2] + 1.0)
         variance += np.einsum("jr,rs,js->j", spread, state.static.cov, spread)
     else:
-        P = full.cov
-        slow = np.diag(P[:t, :t]) + 2.0 * np.diag(P[:t, t:]) + np.diag(P[t:, t:])
-        variance = slow + made.noise.diagonal()
+        variance = full.variance + made.noise.diagonal()
     return offsets(core, state, m), np.sqrt(variance)
 
 
