@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from math import comb
 
@@ -126,6 +127,26 @@ def test_costs_of_many_sets_are_those_of_each(seed: int) -> None:
     given, random = problem(seed), np.random.default_rng(seed)
     sets = random.random((30, given.y.size)) < np.linspace(0.0, 0.9, 30)[:, None]
     assert np.allclose(s.costs(given, sets), [s.cost(given, each) for each in sets], atol=1e-8)
+    with_some = sets | np.isin(np.arange(given.y.size), [1, 2, 9])
+    assert np.allclose(s.costs(given, with_some), [s.cost(given, each) for each in with_some], atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_costs_of_amounts_alike_are_exact(seed: int) -> None:
+    """A share of the variance in common; sets with nothing, and with three faults, that all of them have."""
+    given, random, p = problem(seed), np.random.default_rng(seed), 8
+    given = replace(given, std=random.uniform(0.5, 2.0, given.y.size))
+    sets = random.random((20, given.y.size)) < 0.5
+    for some in (sets, sets | np.isin(np.arange(given.y.size), [1, 2, 9])):
+        for chosen, found in zip(some, s.costs(given, some, s.ALIKE), strict=True):
+            at = np.flatnonzero(chosen)
+            alike = np.where(np.equal.outer(at, at), 1.0, s.ALIKE) * np.logical_and.outer(at < p, at < p)
+            V = np.outer(given.std[at], given.std[at]) * np.where(np.equal.outer(at, at), 1.0, alike)
+            F, y = given.F[np.ix_(at, at)], given.y[at]
+            exact = np.linalg.slogdet(np.eye(at.size) + V @ F)[1]
+            exact -= y @ np.linalg.solve(np.eye(at.size) + V @ F, V @ y)
+            exact += s.penalties(p)[np.count_nonzero(at < p)] + given.charge[at].sum() + given.charge.max()
+            assert found == pytest.approx(exact, abs=1e-7)
 
 
 @pytest.mark.parametrize("seed", range(3))
