@@ -207,31 +207,26 @@ def corrected(before: Sequence[Estimated], T: Sequence[Floats], found: Identific
     found
         The explanations.
     """
-    each = [
-        _one(before[model], T[model], found.problems[model], chosen)
-        for model, chosen in zip(found.model, found.chosen, strict=True)
-    ]
-    means = np.stack([one.mean for one in each])
+    every = list(zip(found.model.tolist(), found.chosen, strict=True))
+    means = np.stack(
+        [
+            before[model].mean + T[model][:, chosen] @ mean_amounts(found.problems[model], chosen)
+            for model, chosen in every
+        ]
+    )
     mean = found.weight @ means
 
     def spread() -> Floats:
-        return np.asarray(found.weight @ (np.stack([one.variance for one in each]) + (means - mean) ** 2))
+        each = [before[k].variance + _of_amounts(T[k], found.problems[k], chosen) for k, chosen in every]
+        return np.asarray(found.weight @ (np.stack(each) + (means - mean) ** 2))
 
     return Estimated(mean, spread)
 
 
-def _one(before: Estimated, T: Floats, problem: SearchProblem, chosen: Bools) -> Estimated:
-    """Estimate under one explanation."""
-    at = np.flatnonzero(chosen)
-    if not at.size:
-        return before
-    moved = T[:, at]
-
-    def spread() -> Floats:
-        more = ((moved @ amounts(problem, chosen)[1]) * moved).sum(axis=1)
-        return np.asarray(before.variance + more)
-
-    return Estimated(before.mean + moved @ mean_amounts(problem, chosen), spread)
+def _of_amounts(T: Floats, problem: SearchProblem, chosen: Bools) -> Floats:
+    """Variance by the amounts of one explanation, (n,)."""
+    moved = T[:, chosen]
+    return np.asarray(((moved @ amounts(problem, chosen)[1]) * moved).sum(axis=1))
 
 
 class Reconstructed(BoundedEstimate):

@@ -282,6 +282,8 @@ def amounts(problem: SearchProblem, chosen: Bools) -> tuple[Floats, Floats]:
 def mean_amounts(problem: SearchProblem, chosen: Bools) -> Floats:
     """Posterior mean of the amounts of a set, (k,): a third of the time of `amounts`."""
     at = np.flatnonzero(chosen)
+    if not at.size:
+        return np.zeros(0)
     A = problem.F[np.ix_(at, at)]
     A[np.diag_indices(at.size)] += problem.std[at] ** -2.0
     return np.asarray(lapack.dposv(A, problem.y[at], lower=True)[1])

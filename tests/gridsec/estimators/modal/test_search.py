@@ -211,6 +211,13 @@ def test_honest_scores_name_nothing() -> None:
     assert named <= 2
 
 
+@pytest.mark.parametrize("some", [(), (1,), (0, 3, 9)])
+def test_mean_amounts_are_those_of_the_posterior(some: tuple[int, ...]) -> None:
+    given = problem(2)
+    chosen = np.isin(np.arange(given.y.size), some)
+    assert np.allclose(s.mean_amounts(given, chosen), s.amounts(given, chosen)[0], atol=1e-9)
+
+
 def test_impossible_amounts_are_not_chosen() -> None:
     """A power that would have to be beyond its bound is left out, and a meter explains it."""
     F = np.array([[50.0, 49.0], [49.0, 50.0]])
