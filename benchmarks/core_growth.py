@@ -4,9 +4,10 @@
 
 The streets of `benchmarks.sequential_step`, one frame per second, all meters honest at first. Calm: median of
 `CALM` steps after `BEFORE` steps, a fourth of both beyond `SEARCHED` customers. Silent: the same while a
-tenth of the meters never reports, from the first step on. Attack: a third of the meters is off by 3 % from one step
-on, the longest of `ATTACK` steps; `modal` up to `SEARCHED` customers. Memory: peak of the process. Processor
-times of the one thread, ms; of several runs the least counts. Each size and estimator has its own process.
+tenth of the meters never reports, from the first step on. Attack: a third of the meters is off by 3 % from
+one step on, the longest of `ATTACK` steps; `modal` up to `SEARCHED` customers. Memory: peak of the process.
+Processor times of the one thread, ms; of several runs the least counts. Each size and estimator has a
+process of its own.
 """
 
 from __future__ import annotations
