@@ -24,6 +24,7 @@ import sys
 import time
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 # Before NumPy loads its libraries.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -32,7 +33,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks._arguments import count
-from gridsec.arrays import Floats
+from gridsec.arrays import Bools, Floats
 from gridsec.estimators import sequential
 from gridsec.estimators.plant import Plant
 from gridsec.estimators.sequential import LoadDoubt
@@ -82,8 +83,8 @@ def street(customers: int) -> Feeder:
     )
 
 
-def design(customers: int) -> sequential.SequentialDesign:
-    """The monitor of a street.
+def plant(customers: int) -> tuple[Plant, LoadDoubt]:
+    """A street with meters and inverters, and the knowledge of its loads.
 
     Parameters
     ----------
@@ -100,9 +101,8 @@ def design(customers: int) -> sequential.SequentialDesign:
         0.0,
         2e-4,
     )
-    plant = Plant(street(customers), droop, np.arange(customers), accuracy, 1)
-    doubt = LoadDoubt(np.full(customers, 0.006), np.full(customers, 0.002), 600.0)
-    return sequential.design(plant, doubt=doubt, step_s=1.0)
+    made = Plant(street(customers), droop, np.arange(customers), accuracy, 1)
+    return made, LoadDoubt(np.full(customers, 0.006), np.full(customers, 0.002), 600.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,12 +136,15 @@ class Watched:
     ----------
     customers
         N.
+    family
+        Module of the estimator, with `design`, `init` and `step`.
     """
 
-    def __init__(self, customers: int) -> None:
-        self.rng = np.random.default_rng(customers)
-        self.made = design(customers)
-        self.state = sequential.init(self.made, 0.0)
+    def __init__(self, customers: int, family: Any = sequential) -> None:
+        self.rng, self.family = np.random.default_rng(customers), family
+        made, doubt = plant(customers)
+        self.made = family.design(made, doubt=doubt, step_s=1.0)
+        self.state = family.init(self.made, 0.0)
         self.p = np.full(customers, -0.01)
         self.liars = np.sort(self.rng.choice(customers, customers // 3, replace=False))
 
@@ -151,7 +154,9 @@ class Watched:
         out[self.liars] = 0.03 * self.rng.choice([-1.0, 1.0], self.liars.size)
         return out
 
-    def play(self, first: int, ticks: int, lies: Floats | float = 0.0) -> Floats:
+    def play(
+        self, first: int, ticks: int, lies: Floats | float = 0.0, *, seen: Bools | None = None
+    ) -> Floats:
         """How long some ticks take, each, ms; `state` is that after them.
 
         Parameters
@@ -160,17 +165,20 @@ class Watched:
             Number of the first tick, and how many.
         lies : (N,)
             What each meter reads too much, parts of the voltage.
+        seen : (N,)
+            Meters with a reading; None: all.
         """
         made, p, size, took = self.made, self.p, self.p.size, np.empty(ticks)
-        none, zero, seen = np.full(size, np.nan), np.zeros(size), np.ones(size, dtype=np.bool_)
+        none, zero = np.full(size, np.nan), np.zeros(size)
+        seen = np.ones(size, dtype=np.bool_) if seen is None else seen
         for k in range(ticks):
-            injected = self.state.x
+            injected = getattr(self.state, "front", self.state).x
             x: Floats = zero if injected is None else np.bincount(made.plant.droop.customer, injected, size)
-            v = np.sqrt(made.plant.feeder.bus_voltages(p, x, 1.0, steps=3)[1:])
-            y = (v * (1.0 + lies) + 5e-4 * self.rng.normal(size=size)) ** 2
+            v: Floats = np.sqrt(made.plant.feeder.bus_voltages(p, x, 1.0, steps=3)[1:])
+            y = np.square(v * (1.0 + lies) + 5e-4 * self.rng.normal(size=size))
             frame = Frame(float(first + k), y, seen, 1.0, p, zero, zero, zero, none, none)
             begun = time.thread_time()
-            self.state, _, _ = sequential.step(made, self.state, frame)
+            self.state, *_ = self.family.step(made, self.state, frame)
             took[k] = 1e3 * (time.thread_time() - begun)
         return took
 

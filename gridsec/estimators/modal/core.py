@@ -14,6 +14,7 @@ loss-corrected power flow. `residuals` reads the residuals that it leaves.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from math import inf, log
 
@@ -277,22 +278,54 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
         The explanations after the same tick.
     """
     named, history = suspicion.found.named, state.history
-    before, known, test, _ = history.start
     first = len(history.readings) - int(state.detector.onsets.age[suspicion.row])
+    begun = None
     if first < 0:
-        begun = _joint(core, history.start, suspicion.row)
+        before, known, *_ = history.start
+        joint = _joint(core, history.start, suspicion.row)
         whole = before.full or full.expanded(core.modes, before, known)
         W = core.faults.W[:, : named.size][:, named]
-        before = replace(before, full=replay.freed(core.modes, whole, begun, W, np.ones(W.shape[1])))
-        test = detector.start(core.modes)
-    test = detector.pin(test, np.zeros(0, np.intp))
-    parts = before, known, test
-    now = CoreState(*parts, None, History((*parts, ())), (), masking.none(core.modes))
-    evidence = Evidence(-inf, np.full(test.capital.shape, -inf))
-    for k, (t, m, seen, unknown) in enumerate(history.readings):
-        read = seen if k < first else ~named if seen is None else seen & ~named
-        now, evidence = step(core, now, t, m, read, unknown)
+        begun = replace(before, full=replay.freed(core.modes, whole, joint, W, np.ones(W.shape[1])))
+
+    def masked(k: int, seen: Bools | None, unknown: Floats | None) -> tuple[Bools | None, Floats | None]:
+        return seen if k < first else ~named if seen is None else seen & ~named, unknown
+
+    now, evidence = again(core, history, first, masked, begun)
     return replace(now, masked=masking.added(state.masked, named)), evidence
+
+
+def again(
+    core: Core,
+    history: History,
+    first: int,
+    change: Callable[[int, Bools | None, Floats | None], tuple[Bools | None, Floats | None]],
+    begun: FilterState | None = None,
+) -> tuple[CoreState, Evidence]:
+    """Replay of kept readings with others in place of some, without a pinned onset; no meter is masked.
+
+    Parameters
+    ----------
+    core, history
+        The core, and the readings.
+    first
+        Number of the first reading that changes; negative: before all that are kept. The detector then starts
+        anew.
+    change
+        Meters with a reading and unknown directions of a tick, by its number and those that are kept.
+    begun
+        Filter before the first kept reading; None: as it was.
+    """
+    kept, (before, known, test, _) = history.until(max(0, first))
+    if first < 0:
+        before, test = begun or before, detector.start(core.modes)
+        kept = History((before, known, test, ()))
+    test = detector.pin(test, np.zeros(0, np.intp))
+    now = CoreState(before, known, test, None, kept, (), masking.none(core.modes))
+    evidence = Evidence(-inf, np.full(test.capital.shape, -inf))
+    for k in range(len(kept.readings), len(history.readings)):
+        t, m, seen, unknown = history.readings[k]
+        now, evidence = step(core, now, t, m, *change(k, seen, unknown))
+    return now, evidence
 
 
 def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
@@ -395,12 +428,11 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     rows = [] if state.suspected else [int(evidence.rows[0])]
     rows = list(dict.fromkeys(rows + np.flatnonzero(test.pinned & test.onsets.used).tolist()))
     found = _searched(core, state, rows[0])
-    std = found.problems[0].std
-    costs = [
-        cost(replace(_problem(core, _joint(core, _parts(state), row)), std=std), found.chosen[0])
-        for row in rows
-    ]
-    best = int(np.argmin(costs))
+    best = 0
+    if len(rows) > 1:
+        std, chosen = found.problems[0].std, found.chosen[0]
+        each = [_problem(core, _joint(core, _parts(state), row), chosen) for row in rows]
+        best = int(np.argmin([cost(replace(one, std=std), chosen) for one in each]))
     if best:
         found = _searched(core, state, rows[best])
     return Suspicion(rows[best], found)
@@ -431,10 +463,14 @@ def _searched(core: Core, state: CoreState, row: int) -> Identification:
     return search(model, core.groups, list(zip(problems, costs, strict=True)))
 
 
-def _problem(core: Core, joint: Joint) -> SearchProblem:
-    """Scores, information and charges of all faults at one onset."""
+def _problem(core: Core, joint: Joint, only: Bools | None = None) -> SearchProblem:
+    """Scores, information and charges of all faults at one onset; zero beside the faults `only` (q,)."""
     faults, p = core.faults, core.modes.size
-    y, F = joint.of(faults.W)
+    if only is None:
+        y, F = joint.of(faults.W)
+    else:
+        y, F = np.zeros(only.size), np.zeros((only.size, only.size))
+        y[only], F[np.ix_(only, only)] = joint.of(faults.W[:, only])
     accusation = 2.0 * log(p)
     charge = np.zeros(y.size)
     charge[p:] = accusation
@@ -463,10 +499,15 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     plain = estimates.honest(made, by, state.filter, state.static, state.update)
     if suspicion is None:
         return plain
-    now = _joint(core, _parts(state), suspicion.row)
-    before, T = [plain], [estimates.moves(made, by, state.filter, now, core.faults.W, core.effect)]
+    found, before, T = suspicion.found, [plain], list[Floats]()
     for each in state.rivals[1:]:
         update = each.update or state.update
         before.append(estimates.honest(each.modes, by, each.filter, each.static, update, loads=each.loads))
-        T.append(estimates.moves(each.modes, by, each.filter, each.joint(), core.faults.W, core.effect))
-    return estimates.corrected(before, T, suspicion.found)
+    for model, filtered in enumerate((state.filter, *(each.filter for each in state.rivals[1:]))):
+        used, moved = found.chosen[found.model == model].any(axis=0), np.zeros_like(core.effect)
+        if used.any():
+            joint = state.rivals[model].joint() if model else _joint(core, _parts(state), suspicion.row)
+            W, effect = core.faults.W[:, used], core.effect[:, used]
+            moved[:, used] = estimates.moves(made, by, filtered, joint, W, effect)
+        T.append(moved)
+    return estimates.corrected(before, T, found)

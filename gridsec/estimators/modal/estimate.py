@@ -22,17 +22,20 @@ Särkkä, Bayesian Filtering and Smoothing, 2013, A.1 (Gaussian conditioning).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, indices, submatrix
 from gridsec.estimators.modal.filter import FilterState, Full, Update
 from gridsec.estimators.modal.model import Modes
-from gridsec.estimators.modal.search import Identification, SearchProblem, amounts
+from gridsec.estimators.modal.search import Identification, SearchProblem, amounts, mean_amounts
 from gridsec.estimators.modal.signatures import Joint
 from gridsec.estimators.modal.static import Static
+from gridsec.estimators.sequential.output import PENDING, BoundedEstimate, BoundInputs
+from gridsec.interface import Estimate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,18 +59,25 @@ class Estimator:
     rest_w: Floats
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Estimated:
     """Errors of the model at n places.
 
     Attributes
     ----------
-    mean, variance : (n,)
-        Expected true squared voltage minus that of the model, squared pu, and its variance.
+    mean : (n,)
+        Expected true squared voltage minus that of the model, squared pu.
+    spread
+        The variance of the mean, (n,), squared pu^2. It takes longer than the rest of a step.
     """
 
     mean: Floats
-    variance: Floats
+    spread: Callable[[], Floats] = field(repr=False)
+
+    @cached_property
+    def variance(self) -> Floats:
+        """Variance of the mean, (n,), squared pu^2, computed on first access."""
+        return self.spread()
 
 
 def estimator(modes: Modes) -> Estimator:
@@ -115,36 +125,42 @@ def honest(
     """
     more = (loads - 1.0) * made.rest_w
     if state.full is not None:
-        return _full(modes, made, state.full, static.score, more)
-    w, b = state.mean
-    e = update.innovation / update.variance
-    by_w, by_b = made.of_w - made.of_e, made.of_b - made.of_e
-    variance = (by_w * by_w) @ state.cov[0] + (by_b * by_b) @ state.cov[2]
-    variance += 2.0 * ((by_w * by_b) @ state.cov[1]) + made.rest + more
-    mean = made.of_w @ w + made.of_b @ b + made.of_e @ e
+        w, b = state.full.mean @ modes.U
+        mean = made.of_w @ w + made.of_b @ b + made.of_e @ static.score
+        return Estimated(mean, partial(_full_variance, modes, made, state.full, more))
+    w, b, e = *state.mean, update.innovation / update.variance
     if modes.sign.size:
-        moved = _theta(modes, made, static)
-        mean += moved @ static.theta
-        variance += np.einsum("xr,rs,xs->x", moved, static.cov, moved)
-    return Estimated(mean, np.maximum(variance, 0.0))
+        (g_w, g_b), known = static.signature, modes.directions @ static.theta
+        w, b, e = w - g_w * known, b + (1.0 - g_b) * known, e - (1.0 - g_w - g_b) * known
+    mean = made.of_w @ w + made.of_b @ b + made.of_e @ e
+    return Estimated(mean, partial(_variance, modes, made, state.cov, static, more))
 
 
-def _full(modes: Modes, made: Estimator, full: Full, score: Floats, more: Floats) -> Estimated:
-    """Estimate by the full covariance: the flicker is seen by the members with a reading only."""
+def _variance(modes: Modes, made: Estimator, cov: Floats, static: Static, more: Floats) -> Floats:
+    """Variance by the covariance of the modes (3, t) and of the directions, (n,)."""
+    moved = _theta(modes, made, static)
+    by_w, by_b = made.of_w - made.of_e, made.of_b - made.of_e
+    out = (by_w * by_w) @ cov[0] + (by_b * by_b) @ cov[2] + 2.0 * ((by_w * by_b) @ cov[1])
+    out += made.rest + more + ((moved @ static.cov) * moved).sum(axis=1)
+    return np.asarray(np.maximum(out, 0.0))
+
+
+def _full_variance(modes: Modes, made: Estimator, full: Full, more: Floats) -> Floats:
+    """Variance by the full covariance, (n,): the flicker is seen by the members with a reading only."""
     model, by_e = modes.model, _flicker(modes, full)
-    by_w, by_b = made.of_w @ modes.U.T, made.of_b @ modes.U.T
-    mean = by_w @ full.mean[0] + by_b @ full.mean[1] + made.of_e @ score
     read = ((by_e @ model.phases(modes.at)) * model.busbar_of).sum(axis=1)
     unread = (made.of_e**2).sum(axis=1) - model.flicker * read
-    by = np.hstack([by_w - by_e, by_b - by_e])
-    return Estimated(mean, np.maximum(((by @ full.cov) * by).sum(axis=1) + made.rest + more + unread, 0.0))
+    by = np.hstack([made.of_w @ modes.U.T - by_e, made.of_b @ modes.U.T - by_e])
+    out = ((by @ full.cov) * by).sum(axis=1) + made.rest + more + unread
+    return np.asarray(np.maximum(out, 0.0))
 
 
 def _theta(modes: Modes, made: Estimator, static: Static) -> Floats:
     """Change of the estimate per amount of each direction, (n, r)."""
     g_w, g_b = static.signature
-    by = made.of_w * -g_w + made.of_b * (1.0 - g_b) - made.of_e * (1.0 - g_w - g_b)
-    return np.asarray(by @ modes.directions)
+    G = modes.directions
+    by_w, by_b = made.of_w @ (G * g_w[:, None]), made.of_b @ (G * (1.0 - g_b)[:, None])
+    return np.asarray(by_b - by_w - made.of_e @ (G * (1.0 - g_w - g_b)[:, None]))
 
 
 def moves(  # noqa: PLR0917  # the state, and the faults
@@ -163,12 +179,10 @@ def moves(  # noqa: PLR0917  # the state, and the faults
     effect : (n, q)
         Change of the model at each place by the faults: zero for meters.
     """
-    felt = joint.level * np.eye(modes.size) - joint.shift[0] - joint.shift[1]
-    by_e = made.of_e
-    if state.full is not None:
-        by_e = _flicker(modes, state.full) @ modes.back
-    by = made.of_w @ joint.shift[0] + made.of_b @ joint.shift[1] + by_e @ felt
-    return np.asarray(effect - by @ W)
+    w, b = joint.shift @ W
+    felt = joint.level * W - w - b
+    of_e = made.of_e @ felt if state.full is None else _flicker(modes, state.full) @ (modes.back @ felt)
+    return np.asarray(effect - made.of_w @ w - made.of_b @ b - of_e)
 
 
 def _flicker(modes: Modes, full: Full) -> Floats:
@@ -189,26 +203,58 @@ def corrected(before: Sequence[Estimated], T: Sequence[Floats], found: Identific
     before
         The honest estimate under each model of the loads.
     T : (n, q) each
-        From `moves`, of all faults of the problem, under each model.
+        From `moves`, of all faults of the problem, under each model; any value for faults in no explanation.
     found
         The explanations.
     """
-    each = [
-        _one(before[model], T[model], found.problems[model], chosen)
-        for model, chosen in zip(found.model, found.chosen, strict=True)
-    ]
-    means = np.stack([one.mean for one in each])
+    every = list(zip(found.model.tolist(), found.chosen, strict=True))
+    means = np.stack(
+        [
+            before[model].mean + T[model][:, chosen] @ mean_amounts(found.problems[model], chosen)
+            for model, chosen in every
+        ]
+    )
     mean = found.weight @ means
-    spread = found.weight @ (np.stack([one.variance for one in each]) + (means - mean) ** 2)
+
+    def spread() -> Floats:
+        each = [before[k].variance + _of_amounts(T[k], found.problems[k], chosen) for k, chosen in every]
+        return np.asarray(found.weight @ (np.stack(each) + (means - mean) ** 2))
+
     return Estimated(mean, spread)
 
 
-def _one(before: Estimated, T: Floats, problem: SearchProblem, chosen: Bools) -> Estimated:
-    """Estimate under one explanation."""
-    at = np.flatnonzero(chosen)
-    if not at.size:
-        return before
-    mean, cov = amounts(problem, chosen)
-    moved = T[:, at]
-    more = np.einsum("xq,qr,xr->x", moved, cov, moved)
-    return Estimated(before.mean + moved @ mean, before.variance + more)
+def _of_amounts(T: Floats, problem: SearchProblem, chosen: Bools) -> Floats:
+    """Variance by the amounts of one explanation, (n,)."""
+    moved = T[:, chosen]
+    return np.asarray(((moved @ amounts(problem, chosen)[1]) * moved).sum(axis=1))
+
+
+class Reconstructed(BoundedEstimate):
+    """Estimate with a standard deviation computed on first access, which takes longer than a step."""
+
+    __slots__ = ("_variance",)
+    _variance: Callable[[], Floats]
+
+    @classmethod
+    def later(
+        cls, grounds: BoundInputs, t: float, v2_bus: Floats, variance: Callable[[], Floats], x: Floats
+    ) -> Reconstructed:
+        """Estimate at Unix time t, s, with the function `variance` of the variance at every place, (n,)."""
+        made = cls(t, v2_bus[grounds.plant.feeder.bus], PENDING, v2_bus, grounds.trusted, x, PENDING)
+        object.__setattr__(made, "_grounds", grounds)
+        object.__setattr__(made, "_variance", variance)
+        return made
+
+    @property
+    def std(self) -> Floats:
+        """Standard deviation of `v2`, (N,)."""
+        slot = Estimate.__dict__["std"]
+        found: Floats = slot.__get__(self)
+        if found is PENDING:
+            found = np.sqrt(self._variance()[self._grounds.plant.feeder.bus])
+            slot.__set__(self, found)
+        return found
+
+    @std.setter
+    def std(self, value: Floats) -> None:
+        Estimate.__dict__["std"].__set__(self, value)

@@ -22,7 +22,7 @@ Anderson and Moore, Optimal Filtering, 1979, chapter 3.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import exp
 
 import numpy as np
@@ -40,21 +40,49 @@ class Full:
     ----------
     mean : (2, t)
         Means of w and b.
-    cov : (2 t, 2 t)
-        Covariance of (w, b).
+    blocks : (t, t) each
+        Covariance of w, of w with b, and of b. Apart, they fit the cache, and no tick allocates the whole.
     seen : (t,)
         Members with a reading at the last tick.
     kept : (3, t)
         As ``cov`` of `FilterState`, of the readings that were there, with its diagonal kept at every tick.
     complete
         Ticks with all readings since the last one without, or since the last attempt to return.
+    share : (t,) or None
+        Part of each mode's information that was read; None where all readings are there.
+    since
+        Ticks since ``share`` was computed.
     """
 
     mean: Floats
-    cov: Floats = field(repr=False)
+    blocks: tuple[Floats, Floats, Floats] = field(repr=False)
     seen: Bools
     kept: Floats
     complete: int
+    share: Floats | None = field(default=None, repr=False)
+    since: int = 0
+
+    @property
+    def cov(self) -> Floats:
+        """Covariance of (w, b), (2 t, 2 t)."""
+        w, both, b = self.blocks
+        return np.block([[w, both], [both.T, b]])
+
+    @property
+    def variance(self) -> Floats:
+        """Variance of w + b, (t,)."""
+        w, both, b = (each.diagonal() for each in self.blocks)
+        return np.asarray(w + 2.0 * both + b)
+
+    def changed(self, mean: Floats, cov: Floats) -> Full:
+        """The same with other means (2, t) and another covariance (2 t, 2 t)."""
+        return replace(self, mean=mean, blocks=blocks(cov))
+
+
+def blocks(cov: Floats) -> tuple[Floats, Floats, Floats]:
+    """Blocks (t, t) of a covariance of (w, b), (2 t, 2 t)."""
+    t = len(cov) // 2
+    return cov[:t, :t].copy(), cov[:t, t:].copy(), cov[t:, t:].copy()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

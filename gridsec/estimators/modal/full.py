@@ -49,6 +49,8 @@ from gridsec.estimators.modal.static import Static
 
 COMPLETE = 64
 """Ticks with all readings before a return to the modes, and from one attempt to the next."""
+SHARED = 16
+"""Ticks for which the gain of the signatures is scaled alike while the same members report."""
 MARGIN = 0.1
 """Enlargement of the variance at the return, 1: standard deviations are too large by 5 % at first."""
 
@@ -95,10 +97,13 @@ def step(  # noqa: PLR0917  # the states of both parts, and one tick
     after, update = modal.step(modes, state, t, m, seen)
     if state.full is not None:
         full, innovation = updated(modes, state.full, t - state.t, m, None if whole else seen, unknown)
-        sigma, _ = lapack.dtrtrs(innovation.half, innovation.white, lower=True, trans=1)
-        score = sigma @ modes.back[innovation.rows]
-        kept, slower = _kept(modes, full.kept, update)
-        after = replace(after, full=replace(full, kept=kept))
+        score = np.zeros(modes.size)
+        if innovation.rows.size:
+            sigma, _ = lapack.dtrtrs(innovation.half, innovation.white, lower=True, trans=1)
+            score = sigma @ modes.back[innovation.rows]
+        share, since = _share(modes, state.full, update)
+        kept, slower = _kept(modes, full.kept, update, share)
+        after = replace(after, full=replace(full, kept=kept, share=share, since=since))
         update = replace(update, slower=slower, exact=innovation, score=score)
     return after, static.follow(modes, known, update), update
 
@@ -111,14 +116,15 @@ def expanded(modes: Modes, state: FilterState, known: Static) -> Full:
     modes, state, known
         The modes, the filter and the information about the directions after the last tick.
     """
-    back, blocks = modes.back, [(modes.back * c) @ modes.back.T for c in state.cov]
-    cov = np.block([[blocks[0], blocks[1]], [blocks[1], blocks[2]]])
+    back = modes.back
+    w, both, b = ((back * c) @ back.T for c in state.cov)
     mean = state.mean @ back.T
     if modes.sign.size:
-        T = _turned(modes, known)
-        cov += T @ static.current(modes, known).cov @ T.T
+        T, N = _turned(modes, known), static.current(modes, known).cov
+        T_w, T_b = T[: modes.size], T[modes.size :]
+        w, both, b = w + T_w @ N @ T_w.T, both + T_w @ N @ T_b.T, b + T_b @ N @ T_b.T
         mean = mean + (T @ known.theta).reshape(2, -1)
-    return Full(mean, cov, np.ones(modes.size, dtype=np.bool_), state.cov, 0)
+    return Full(mean, (w, both, b), np.ones(modes.size, dtype=np.bool_), state.cov, 0)
 
 
 def _turned(modes: Modes, known: Static) -> Floats:
@@ -151,23 +157,20 @@ def updated(  # noqa: PLR0917  # the filter, and one tick
     t, rows = modes.size, np.arange(modes.size) if seen is None else indices(seen)
     rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
     mean = before.mean * np.array([[rho], [rho_b]])
-    P = before.cov * (rho * rho_b)
-    P[:t, :t] *= rho / rho_b
-    P[:t, :t] += (1.0 - rho * rho) * modes.covariance_w
-    P[t:, t:] *= rho_b / rho
-    P[t:, t:] += (1.0 - rho_b * rho_b) * modes.covariance_b
+    w, both, b = before.blocks
+    w, both, b = w * rho**2, both * (rho * rho_b), b * rho_b**2
+    w += (1.0 - rho * rho) * modes.covariance_w
+    b += (1.0 - rho_b * rho_b) * modes.covariance_b
     if not rows.size:
         none = np.zeros((2 * t, 0))
-        return Full(mean, P, np.zeros(t, dtype=np.bool_), before.kept, 0), Innovation(
+        return Full(mean, (w, both, b), np.zeros(t, dtype=np.bool_), before.kept, 0), Innovation(
             rows, none[:0], none, none[0], np.zeros(t)
         )
-    nu = m - mean[0] - mean[1]
-    if seen is None:
-        seen, HP, D, complete = np.ones(t, dtype=np.bool_), P[:t] + P[t:], modes.noise, before.complete + 1
-        V = HP[:, :t] + HP[:, t:] + D
-    else:
-        nu, HP, D, complete = nu[rows], P[rows] + P[t + rows], submatrix(modes.noise, rows, rows), 0
-        V = (HP[:, :t] + HP[:, t:])[:, rows] + D
+    complete, nu = before.complete + 1 if seen is None else 0, (m - mean[0] - mean[1])[rows]
+    HP = np.empty((rows.size, 2 * t))
+    np.add(w[rows], both[:, rows].T, out=HP[:, :t])
+    np.add(both[rows], b[rows], out=HP[:, t:])
+    V = HP[:, rows] + HP[:, t + rows] + submatrix(modes.noise, rows, rows)
     if unknown is not None:
         V, complete = V + unknown[rows] @ unknown[rows].T, 0
     half, failed = lapack.dpotrf(V.T, lower=True, overwrite_a=True, clean=True)
@@ -176,11 +179,17 @@ def updated(  # noqa: PLR0917  # the filter, and one tick
     gain = blas.dtrsm(1.0, half, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1)
     white, _ = lapack.dtrtrs(half, nu, lower=True)
     mean += (gain @ white).reshape(2, t)
-    P -= gain @ gain.T
+    of_w, of_b = gain[:t], gain[t:]
+    w -= of_w @ of_w.T
+    both -= of_w @ of_b.T
+    b -= of_b @ of_b.T
     inverse, _ = lapack.dtrtri(half, lower=True)
     precision = np.zeros(t)
     precision[rows] = (inverse * inverse).sum(axis=0)
-    return Full(mean, P, seen, before.kept, complete), Innovation(rows, half, gain, white, precision)
+    seen = np.ones(t, dtype=np.bool_) if seen is None else seen
+    return Full(mean, (w, both, b), seen, before.kept, complete), Innovation(
+        rows, half, gain, white, precision
+    )
 
 
 def expected(modes: Modes, before: Full, h: float, rows: Ints) -> Floats:
@@ -196,33 +205,41 @@ def expected(modes: Modes, before: Full, h: float, rows: Ints) -> Floats:
         Members with a reading.
     """
     rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
-    P, w, b = before.cov, rows, modes.size + rows
-    V = rho * rho * submatrix(P, w, w) + rho_b * rho_b * submatrix(P, b, b)
-    V += rho * rho_b * (submatrix(P, w, b) + submatrix(P, b, w)) + submatrix(modes.noise, rows, rows)
+    w, both, b = (submatrix(each, rows, rows) for each in before.blocks)
+    V = rho * rho * w + rho_b * rho_b * b
+    V += rho * rho_b * (both + both.T) + submatrix(modes.noise, rows, rows)
     V += (1.0 - rho * rho) * submatrix(modes.covariance_w, rows, rows)
     V += (1.0 - rho_b * rho_b) * submatrix(modes.covariance_b, rows, rows)
     return V
 
 
-def _kept(modes: Modes, kept: Floats, update: Update) -> tuple[Floats, Floats]:
-    """Diagonal covariance after one tick, (3, t), and its gain, (2, t).
-
-    The gain of complete readings is multiplied by the part of each mode's information that was read,
-    ``1 - diag(U_g' (A_gg)^-1 U_g) / v``, with ``A = U diag(1 / v) U'`` and g the members without a reading.
-    """
+def _kept(modes: Modes, kept: Floats, update: Update, share: Floats | None) -> tuple[Floats, Floats]:
+    """Diagonal covariance after one tick, (3, t), and its gain, (2, t), times the share that was read."""
     cov, shared, v = modal.predicted(modes, kept, *update.decay)
     gain = shared / v
-    if update.seen is not None:
-        g = indices(~update.seen)
-        U = modes.U[g]
-        if g.size == modes.size:
-            return cov, 0.0 * gain
-        half, _ = lapack.dpotrf((U / v) @ U.T, lower=True, clean=True)
-        spread, _ = lapack.dtrtrs(half, U, lower=True)
-        gain = gain * np.clip(1.0 - (spread * spread).sum(axis=0) / v, 0.0, 1.0)
+    if share is not None:
+        gain *= share
     cov[:2] -= gain * shared[0]
     cov[2] -= gain[1] * shared[1]
     return cov, gain
+
+
+def _share(modes: Modes, before: Full, update: Update) -> tuple[Floats | None, int]:
+    """Part of each mode's information that was read, (t,), and its age, ticks.
+
+    It is ``1 - diag(U_g' (A_gg)^-1 U_g) / v``, ``A = U diag(1 / v) U'``, g the members without a reading.
+    While the same members report it changes slowly, and is taken over for `SHARED` ticks.
+    """
+    if update.seen is None:
+        return None, 0
+    if before.share is not None and before.since < SHARED and np.array_equal(before.seen, update.seen):
+        return before.share, before.since + 1
+    g, v = indices(~update.seen), modal.predicted(modes, before.kept, *update.decay)[2]
+    if g.size == modes.size:
+        return np.zeros(modes.size), 0
+    half, _ = lapack.dpotrf((modes.U[g] / v) @ modes.U[g].T, lower=True, clean=True)
+    spread, _ = lapack.dtrtrs(half, modes.U[g], lower=True)
+    return np.clip(1.0 - (spread * spread).sum(axis=0) / v, 0.0, 1.0), 0
 
 
 def _returned(modes: Modes, state: FilterState, full: Full, known: Static) -> tuple[FilterState, Static]:
@@ -230,8 +247,8 @@ def _returned(modes: Modes, state: FilterState, full: Full, known: Static) -> tu
     t, U, known = modes.size, modes.U, static.current(modes, known)
     T = _turned(modes, known).reshape(2, t, -1)
     T = np.vstack([U.T @ T[0], U.T @ T[1]])
-    P = np.vstack([U.T @ full.cov[:t], U.T @ full.cov[t:]])
-    P = np.hstack([P[:, :t] @ U, P[:, t:] @ U])
+    of_w, both, of_b = (U.T @ each @ U for each in full.blocks)
+    P = np.block([[of_w, both], [both.T, of_b]])
     # The information of complete readings is more than that of theta.
     now = static.current(modes, replace(known, information=known.information / (1.0 + MARGIN) ** 2))
     rest, bound = P - T @ known.cov @ T.T, T @ now.cov @ T.T - P

@@ -72,8 +72,7 @@ def follow(modes: Modes, masked: Masked, full: Full, m: Floats, seen: Bools | No
     m, seen : (t,)
         Residuals, and members with a reading, the masked ones included; None: all.
     """
-    t, P, d = modes.size, full.cov, modes.noise.diagonal()
-    slow = np.diag(P[:t, :t]) + 2.0 * np.diag(P[:t, t:]) + np.diag(P[t:, t:])
+    slow, d = full.variance, modes.noise.diagonal()
     read = masked.meters if seen is None else masked.meters & seen
     off = m - full.mean[0] - full.mean[1]
     fits = off * off <= OUTLIER**2 * (slow + d)

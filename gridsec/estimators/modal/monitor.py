@@ -20,18 +20,18 @@ meter is named likewise; its phase then counts as not metered, until the meters 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, changed
-from gridsec.estimators.modal import core, detector, doubts, full, masking, record, verdict
+from gridsec.estimators.modal import core, doubts, full, masking, record, verdict
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.doubts import Unknown
+from gridsec.estimators.modal.estimate import Estimated, Reconstructed
 from gridsec.estimators.modal.record import Record
-from gridsec.estimators.modal.replay import History
 from gridsec.estimators.modal.search import DOUBT
 from gridsec.estimators.plant import Plant, nothing_new
 from gridsec.estimators.sequential import design as front_design
@@ -67,7 +67,7 @@ from gridsec.estimators.sequential.meter_bias import (
     ready_meters,
     usable,
 )
-from gridsec.estimators.sequential.output import BoundedEstimate, BoundInputs
+from gridsec.estimators.sequential.output import BoundInputs
 from gridsec.estimators.sequential.posterior import UNMETERED, LoadDoubt
 from gridsec.estimators.sequential.state import Prediction, SequentialState, SuspicionRecord
 from gridsec.estimators.sequential.step import predict
@@ -292,10 +292,15 @@ def _driven(
     if kernel.update is None or not front.meter_of.size or given.x is None:
         return given, measured, predicted
     m = measured.y - predicted.v2_bus[front.prior.meters]
-    off, std = verdict.deviations(design.core, kernel, m)
     drives = np.zeros(m.size, dtype=np.bool_)
     drives[front.meter_of[front.meter_of >= 0]] = True
-    jumps = drives & measured.available & given.trust.trusted & (np.abs(off) > JUMP * std)
+    drives &= measured.available & given.trust.trusted
+    # The variance is at least that of the white errors.
+    far = np.abs(verdict.offsets(design.core, kernel, m)) > JUMP * np.sqrt(design.core.modes.noise.diagonal())
+    if not any_of(drives & far):
+        return given, measured, predicted
+    off, std = verdict.deviations(design.core, kernel, m)
+    jumps = drives & (np.abs(off) > JUMP * std)
     if not 0 < np.count_nonzero(jumps) <= design.max_attacked:
         # Where most readings jump, the busbar's or the loads have; then no inverter can do without them.
         return given, measured, predicted
@@ -382,22 +387,13 @@ def _without_busbar(
     named = np.zeros(H.shape[1], dtype=np.bool_)
     named[H.any(axis=0)] = which
     columns = doubts.WIDER * UNMETERED * H[:, named]
-    before, known, test, _ = kernel.history.start
     first = len(kernel.history.readings) - int(kernel.detector.onsets.age[suspicion.row])
-    if first < 0:
-        test = detector.start(modes)
-    parts = before, known, detector.pin(test, np.zeros(0, np.intp)), ()
-    now = replace(
-        core.init(design.core, before.t),
-        filter=before,
-        static=known,
-        detector=parts[2],
-        history=History(parts),
-    )
-    evidence = Evidence(-np.inf, np.full(test.capital.shape, -np.inf))
-    for k, (t, m, seen, unknown) in enumerate(kernel.history.readings):
-        more = unknown if k < first else columns if unknown is None else np.hstack([unknown, columns])
-        now, evidence = core.step(design.core, now, t, m, seen, more)
+
+    def unmetered(k: int, seen: Bools | None, unknown: Floats | None) -> tuple[Bools | None, Floats | None]:
+        more = columns if unknown is None else np.hstack([unknown, columns])
+        return seen, unknown if k < first else more
+
+    now, evidence = core.again(design.core, kernel.history, first, unmetered)
     after = replace(
         state,
         front=changed(state.front, busbar=_suspected_busbar(front, state.front.busbar, named)),
@@ -431,8 +427,8 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
     named, seen = kernel.masked.meters, tick.measured.available
     suspected = any_of(kernel.detector.pinned)
     trust = _trust(design, now, named, state.suspicion)
-    estimate, of_busbar = _estimate(design, replace(state, front=trust), tick)
-    busbar = _busbar(design, now, tick, estimate, of_busbar)
+    estimate, spread = _estimate(design, replace(state, front=trust), tick)
+    busbar = _busbar(design, now, tick, estimate, spread)
     evidence = verdict.meter_evidence(
         design.core, kernel, tick.evidence, (tick.m, seen), front.options.widest, state.suspicion
     )
@@ -525,24 +521,25 @@ def _settled(front: SequentialDesign, predicted: Prediction) -> bool:
 
 
 def _busbar(
-    design: ModalDesign, now: SequentialState, tick: _Tick, estimate: Estimate, variance: Floats
+    design: ModalDesign, now: SequentialState, tick: _Tick, estimate: Estimate, spread: Callable[[], Floats]
 ) -> BusbarTrust:
     """Trust of the busbar's meter: a named phase is compared with the estimate until both agree."""
     if all_of(now.busbar.trusted):
         return now.busbar
     measured, front = tick.measured, design.front
+    first = front.plant.feeder.busbar_places()
+    v0_squared, variance = estimate.v2_bus[first], np.atleast_1d(spread()[first])
     there = measured.busbar_available & np.isfinite(variance)
-    v0_squared = estimate.v2_bus[front.plant.feeder.busbar_places()]
     allowed = float(front.allowed.max())
     return track_busbar(front, now.busbar, measured.busbar_reading, there, v0_squared, variance, allowed)
 
 
-def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Estimate, Floats]:
-    """Voltages by the model and the core, with standard deviation and bound; variance at the busbar, (b,)."""
+def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Estimate, Callable[[], Floats]]:
+    """Voltages by the model and the core, with standard deviation and bound; the core's variance, (n,)."""
     front, kernel, measured = design.front, design.core, tick.measured
     plant, now = front.plant, state.front
     errors = core.estimate(kernel, state.core, state.suspicion)
-    mean, variance = errors.mean, errors.variance
+    mean, spread = errors.mean, _Spread(errors)
     whole = state.core.filter.full
     if tick.unknown is not None and whole is not None:
         u, read = tick.m - whole.mean[0] - whole.mean[1], whole.seen
@@ -552,11 +549,9 @@ def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Esti
             u = u - (mean - plain.mean)[front.prior.meters]
             read = read & ~verdict.accused(kernel, state.suspicion)
         more = doubts.estimated(kernel.modes, tick.unknown, u, read)
-        mean, variance = mean + more[0], variance + more[1]
+        mean, spread = mean + more[0], _Spread(errors, more[1])
     v2_bus, first = tick.predicted.v2_bus + mean, plant.feeder.busbar_places()
     v2_bus[first] = np.where(measured.busbar_metered, measured.v0_squared, v2_bus[first])
-    variance, of_busbar = variance.copy(), variance[first].copy()
-    variance[first] = np.maximum(variance[first], np.where(measured.busbar_metered, front.busbar**2, 0.0))
     # While the readings disagree and no search has settled it, no reading bounds a voltage.
     sure = now.trust.trusted & measured.available & (not any_of(state.core.detector.pinned))
     inputs = BoundInputs(
@@ -570,8 +565,24 @@ def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Esti
         checked=_Checked(front, measured.frame),
         sigmas=front.sigmas[0],
     )
-    made = BoundedEstimate.of(inputs, measured.frame.t, v2_bus, variance, tick.predicted.x)
-    return made, np.atleast_1d(of_busbar)
+    least = replace(spread, places=first, least=np.where(measured.busbar_metered, front.busbar**2, 0.0))
+    return Reconstructed.later(inputs, measured.frame.t, v2_bus, least, tick.predicted.x), spread
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Spread:
+    """Variance of the voltages at all places, (n,), evaluated where asked for."""
+
+    errors: Estimated
+    more: Floats | float = 0.0  # of unknown directions
+    places: slice | None = None  # busbar
+    least: Floats | float = 0.0  # at `places`
+
+    def __call__(self) -> Floats:
+        out = self.errors.variance + self.more
+        if self.places is not None:
+            out[self.places] = np.maximum(out[self.places], self.least)
+        return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -617,7 +628,7 @@ def _kinds(
     references, meters = front.references, front.plant.meters
     own = np.asarray(references.active * measured.frame.p[meters] + references.reactive * measured.q[meters])
     expected = estimate.v2_bus[front.prior.meters]
-    variance = np.maximum(estimate.std[meters] ** 2 + front.white, front.white)
+    variance = front.white
     if any_of(named):
         expected = expected + own_errors(design, kernel)
         variance = verdict.deviations(design.core, kernel, tick.m)[1] ** 2
@@ -660,7 +671,7 @@ def _errors(design: ModalDesign, state: ModalState, done: Bools) -> Learned:
     """Fixed errors of the filter, for the meters `done` (p,)."""
     front, modes, known, kernel = design.front, design.core.modes, state.front.learned, state.core
     whole = kernel.filter.full or full.expanded(modes, kernel.filter, kernel.static)
-    B, P = modes.covariance_b, whole.cov[modes.size :, modes.size :]
+    B, P = modes.covariance_b, whole.blocks[2]
     fixed = design.core.model.fixed
     variance = np.clip(fixed - ((design.own @ (B - P)) * design.own).sum(axis=1), 0.0, front.fixed)
     aging = front.options.stability * (front.allowed - front.rounded)
@@ -697,7 +708,7 @@ def renew(design: ModalDesign, state: ModalState, which: Bools) -> ModalState:
     cov[np.ix_(t + at, t + at)] += 2.0 * np.diag(fixed) - K @ modes.covariance_b @ K.T
     mean = (A @ whole.mean.ravel()).reshape(2, t)
     blank = core.init(design.core, kernel.filter.t)
-    opened = replace(kernel.filter, full=replace(whole, mean=mean, cov=cov, complete=0))
+    opened = replace(kernel.filter, full=replace(whole.changed(mean, cov), complete=0))
     parts = opened, kernel.static, blank.detector
     masked = masking.Masked(
         kernel.masked.meters & ~which,

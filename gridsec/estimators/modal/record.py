@@ -86,8 +86,8 @@ def _bounded(  # noqa: PLR0917  # the filter, and the two enlargements
     """Record with enlarged variances; None where it is no upper bound."""
     t, U = modes.size, modes.U
     w, b = np.arange(t), np.arange(t, 2 * t)
-    P = np.vstack([U.T @ whole.cov[:t], U.T @ whole.cov[t:]])
-    P = np.hstack([P[:, :t] @ U, P[:, t:] @ U])
+    of_w, both, of_b = (U.T @ each @ U for each in whole.blocks)
+    P = np.block([[of_w, both], [both.T, of_b]])
     now = static.current(
         modes, replace(known, information=known.information * (1.0 - prior) / (1.0 + more) ** 2)
     )

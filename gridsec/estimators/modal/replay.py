@@ -33,6 +33,9 @@ from gridsec.estimators.modal.static import Static
 HALF = 64
 """Ticks from one kept state of the filter to the next; two of them cover the readings that are kept."""
 
+NEAR = 16
+"""Ticks from one to the next of the two youngest kept states: most onsets are named within so many ticks."""
+
 Reading = tuple[float, Floats, Bools | None, Floats | None]
 """Time, residuals (t,), members with a reading (t,), and unknown directions (t, k) of a tick."""
 
@@ -80,11 +83,24 @@ class History:
         The ticks, at most ``2 HALF``.
     middle
         As ``start``, after the first `HALF` readings; None before.
+    recent
+        Numbers of readings, and the states after them, as ``start``: the two youngest multiples of `NEAR`.
     """
 
     start: Parts = field(repr=False)
     readings: tuple[Reading, ...] = field(default=(), repr=False)
     middle: Parts | None = field(default=None, repr=False)
+    recent: tuple[tuple[int, Parts], ...] = field(default=(), repr=False)
+
+    def until(self, count: int) -> tuple[History, Parts]:
+        """The history up to a kept state, the latest one after at most `count` readings, and this state."""
+        states = [(0, self.start), *self.recent]
+        if self.middle is not None:
+            states.append((HALF, self.middle))
+        at, parts = max((each for each in states if each[0] <= count), key=lambda each: each[0])
+        recent = tuple(each for each in self.recent if each[0] <= at)
+        middle = self.middle if at >= HALF else None
+        return History(self.start, self.readings[:at], middle, recent), parts
 
 
 def record(
@@ -103,12 +119,16 @@ def record(
     unknown : (t, k)
         Unknown directions.
     """
-    readings = (*history.readings, (after[0].t, m, seen, unknown))
-    if len(readings) == HALF:
-        return replace(history, readings=readings, middle=after)
-    if len(readings) == 2 * HALF and history.middle is not None:
-        return History(history.middle, readings[HALF:], after)
-    return replace(history, readings=readings)
+    readings, recent = (*history.readings, (after[0].t, m, seen, unknown)), history.recent
+    count, middle = len(readings), history.middle
+    if count % NEAR == 0:
+        recent = (*recent[-1:], (count, after))
+    if count == HALF:
+        middle = after
+    if count == 2 * HALF and middle is not None:
+        recent = tuple((at - HALF, parts) for at, parts in recent)
+        return History(middle, readings[HALF:], after, recent)
+    return History(history.start, readings, middle, recent)
 
 
 def replayed(modes: Modes, history: History, onsets: Onsets, rows: Sequence[int]) -> tuple[Suspected, ...]:
@@ -224,4 +244,4 @@ def freed(  # the filter, and the faults
     if loads:
         X[: modes.size] -= joint.level * (modes.back @ W)
     gain = np.linalg.solve(F + np.diag(std**-2.0), X.T).T
-    return replace(full, mean=full.mean - (gain @ y).reshape(2, -1), cov=full.cov + gain @ X.T)
+    return full.changed(full.mean - (gain @ y).reshape(2, -1), full.cov + gain @ X.T)

@@ -202,7 +202,8 @@ def follow(
     state, known, update = exact.step(modes, state, known, t, m, seen, stay=True, unknown=unknown)
     if update.exact is None:
         total -= 0.5 * float((update.innovation**2 / update.variance + np.log(update.variance)).sum())
-        onsets = signatures.follow(modes, onsets, update, known, h, begun=[0] if begun else [])
+        if begun or onsets.used[0]:
+            onsets = signatures.follow(modes, onsets, update, known, h, begun=[0] if begun else [])
     else:
         half, white = update.exact.half, update.exact.white
         total -= 0.5 * float(white @ white) + float(np.log(half.diagonal()).sum())
@@ -253,10 +254,8 @@ def _jump(  # noqa: PLR0917  # the states of both parts, and one tick
         nu = m @ modes.U - rho * state.mean[0] - rho_b * state.mean[1]
         if modes.sign.size:
             nu -= (1.0 - rho * g[0] - rho_b * g[1]) * (modes.directions @ known.theta)
-        each = []
-        for prior, size in zip(priors, sizes, strict=True):
-            w = v + size * varying
-            each.append(prior - 0.5 * float((nu**2 / w + np.log(w)).sum()))
+        w = v + np.multiply.outer(sizes, varying)
+        each = (priors - 0.5 * (nu * nu / w + np.log(w)).sum(axis=1)).tolist()
     else:
         n = np.arange(modes.size) if seen is None else indices(seen)
         if not n.size:
@@ -282,7 +281,6 @@ def _jumped(modes: Modes, state: FilterState, h: float, size: float) -> FilterSt
     cov, full = state.cov.copy(), state.full
     cov[0] += more * (1.0 - modes.model.lasting) * modes.loads
     if full is not None:
-        t, P = modes.size, full.cov.copy()
-        P[:t, :t] += more * modes.jumps
-        full = replace(full, cov=P)
+        w, both, b = full.blocks
+        full = replace(full, blocks=(w + more * modes.jumps, both, b))
     return replace(state, cov=cov, full=full)

@@ -26,7 +26,7 @@ without a fault is at most 1.
 readings; k is the gain ``slower``. So y of a column x_t is a martingale with the variance ``sum x_t' E V^-1
 E' x_t``, E selecting the readings. v is that of complete readings, ``E V^-1 E' <= diag(1 / v)``. So I is an
 upper bound, and the mean of ``exp(y f - I f^2 / 2)`` is at most 1. For single members the bound is lowered,
-``read``: the part of a fault that the member itself feels counts with the exact ``(V^-1)_jj`` in place of
+``lost``: the part of a fault that the member itself feels counts with the exact ``(V^-1)_jj`` in place of
 ``(U diag(1 / v) U')_jj``, 0 without a reading. That is exact for white errors.
 
 References
@@ -71,8 +71,8 @@ class Onsets:
         g of w and of b, after the last update.
     score, information, cross : (k, t)
         Score of the exact innovation, i and c.
-    read : (k, t) or None
-        Part of i at each member that was read; None where nothing is missing since the filter is modal.
+    lost : (k, t) or None
+        Part of i at each member that was not read; None where nothing is missing since the filter is modal.
     """
 
     age: Ints
@@ -83,7 +83,7 @@ class Onsets:
     score: Floats = field(repr=False)
     information: Floats = field(repr=False)
     cross: Floats = field(repr=False)
-    read: Floats | None = field(default=None, repr=False)
+    lost: Floats | None = field(default=None, repr=False)
 
 
 def empty(modes: Modes, steps: int, ramps: int = 0) -> Onsets:
@@ -119,7 +119,7 @@ def single(onsets: Onsets, row: int) -> Onsets:
     onsets, row
         The onsets, and the row.
     """
-    at, read = slice(row, row + 1), onsets.read
+    at, lost = slice(row, row + 1), onsets.lost
     return Onsets(
         onsets.age[at],
         onsets.used[at],
@@ -129,7 +129,7 @@ def single(onsets: Onsets, row: int) -> Onsets:
         onsets.score[at],
         onsets.information[at],
         onsets.cross[at],
-        None if read is None else read[at],
+        None if lost is None else lost[at],
     )
 
 
@@ -175,32 +175,31 @@ def follow(
     score -= onsets.cross * static.moved
     score += onsets.score
     information = weighed * gamma
-    read = _read(modes, onsets, update, gamma)
+    lost = _lost(modes, onsets, update, gamma)
     information += onsets.information
     cross = weighed * static.gamma
     cross += onsets.cross
     g += (update.gain if update.slower is None else update.slower)[:, None, :] * gamma
     for row in ended:
         g[:, row] = score[row] = information[row] = cross[row] = 0.0
-        if read is not None:
-            read[row] = 0.0
-    return Onsets(age + used, used, onsets.ramp, level, g, score, information, cross, read)
+        if lost is not None:
+            lost[row] = 0.0
+    return Onsets(age + used, used, onsets.ramp, level, g, score, information, cross, lost)
 
 
-def _read(modes: Modes, onsets: Onsets, update: Update, gamma: Floats) -> Floats | None:
-    """Part of the information at each member that was read, with that of one tick, (k, t).
+def _lost(modes: Modes, onsets: Onsets, update: Update, gamma: Floats) -> Floats | None:
+    """Part of the information at each member that was not read, with that of one tick, (k, t).
 
-    Only the effect of a member's fault on its own reading is lost with that reading.
+    Only the effect of a member's fault on its own reading is lost with that reading. The part is at most the
+    information, by Cauchy's inequality, since ``diag(white) <= D``.
     """
     if update.exact is None:
         return None
-    felt = gamma / np.sqrt(update.variance)
-    out = (felt * felt) @ modes.squares.T
-    white = modes.model.white[modes.at]
-    own = np.minimum((felt @ modes.squares.T) ** 2 * white, out)
-    out -= own * (1.0 - np.minimum(update.exact.precision / (modes.squares @ (1.0 / update.variance)), 1.0))
-    out += onsets.information @ modes.squares.T if onsets.read is None else onsets.read
-    return np.asarray(out)
+    own = (gamma / np.sqrt(update.variance)) @ modes.squares.T
+    own *= own
+    whole = modes.squares @ (1.0 / update.variance)
+    own *= modes.model.white[modes.at] * (1.0 - np.minimum(update.exact.precision / whole, 1.0))
+    return own if onsets.lost is None else own + onsets.lost
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -256,7 +255,7 @@ def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _A
     """
     r = modes.sign.size
     score, information = onsets.score[rows], onsets.information[rows]
-    share = None if onsets.read is None else _share(modes, information, onsets.read[rows])
+    share = None if onsets.lost is None else _share(modes, information, onsets.lost[rows])
     if not r:
         return Scores(score, information, np.zeros((len(score), 0, modes.size)), np.zeros((0, 0)), share)
     cross, G, cov = onsets.cross[rows], modes.directions, static.cov
@@ -265,10 +264,10 @@ def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _A
     return Scores(score, information, cross[:, None, :] * G.T, cov, share)
 
 
-def _share(modes: Modes, information: Floats, read: Floats) -> Floats:
+def _share(modes: Modes, information: Floats, lost: Floats) -> Floats:
     """Share of the information that was read at each member, (k, t); 1 where there is none."""
     whole = information @ modes.squares.T
-    return np.asarray(np.where(whole > 0.0, read / np.where(whole > 0.0, whole, 1.0), 1.0))
+    return np.asarray(1.0 - lost / np.where(whole > 0.0, whole, 1.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

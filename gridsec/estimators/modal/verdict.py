@@ -135,18 +135,34 @@ def deviations(core: Core, state: CoreState, m: Floats) -> tuple[Floats, Floats]
         Residuals.
     """
     full, made = state.filter.full, core.modes
-    t = made.size
     if full is None:
-        felt = 1.0 - state.static.signature[0] - state.static.signature[1]
-        spread = made.back @ (felt[:, None] * made.directions)
-        mean = made.back @ state.filter.mean.sum(axis=0) + spread @ state.static.theta
-        P = state.filter.cov
+        spread, P = _spread(core, state), state.filter.cov
         variance = (made.back * made.back) @ (P[0] + 2.0 * P[1] + P[2] + 1.0)
         variance += np.einsum("jr,rs,js->j", spread, state.static.cov, spread)
-        return m - mean, np.sqrt(variance)
-    P = full.cov
-    slow = np.diag(P[:t, :t]) + 2.0 * np.diag(P[:t, t:]) + np.diag(P[t:, t:])
-    return m - full.mean[0] - full.mean[1], np.sqrt(slow + made.noise.diagonal())
+    else:
+        variance = full.variance + made.noise.diagonal()
+    return offsets(core, state, m), np.sqrt(variance)
+
+
+def offsets(core: Core, state: CoreState, m: Floats) -> Floats:
+    """Deviation of every reading from the filter, (p,).
+
+    Parameters
+    ----------
+    core, state, m
+        As in `deviations`.
+    """
+    full, made = state.filter.full, core.modes
+    if full is not None:
+        return np.asarray(m - full.mean[0] - full.mean[1])
+    mean = made.back @ state.filter.mean.sum(axis=0)
+    return np.asarray(m - mean - _spread(core, state) @ state.static.theta)
+
+
+def _spread(core: Core, state: CoreState) -> Floats:
+    """Change of the expected readings per amount of each direction, (p, r)."""
+    felt = 1.0 - state.static.signature[0] - state.static.signature[1]
+    return np.asarray(core.modes.back @ (felt[:, None] * core.modes.directions))
 
 
 def _row(state: CoreState, evidence: Evidence, suspicion: Suspicion | None) -> int:

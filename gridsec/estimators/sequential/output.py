@@ -643,7 +643,7 @@ def _intersection(low: Floats, high: Floats, other_low: Floats, other_high: Floa
 
 
 # Placeholder of a bound that is not computed yet.
-_PENDING: Floats = np.zeros(0)
+PENDING: Floats = np.zeros(0)
 
 
 class BoundedEstimate(Estimate):
@@ -661,7 +661,7 @@ class BoundedEstimate(Estimate):
     ) -> BoundedEstimate:
         """Estimate at Unix time t, s, with variance (n,) at every place."""
         bus = grounds.plant.feeder.bus
-        made = cls(t, v2_bus[bus], _PENDING, v2_bus, grounds.trusted, x, np.sqrt(variance[bus]))
+        made = cls(t, v2_bus[bus], PENDING, v2_bus, grounds.trusted, x, np.sqrt(variance[bus]))
         object.__setattr__(made, "_grounds", grounds)
         return made
 
@@ -670,7 +670,7 @@ class BoundedEstimate(Estimate):
         """Half-width of the interval around `v2` that contains the truth within the stated errors, (N,)."""
         slot = Estimate.__dict__["bound"]
         found: Floats = slot.__get__(self)
-        if found is _PENDING:
+        if found is PENDING:
             found = self._grounds.half_width(self.v2)
             slot.__set__(self, found)
         return found

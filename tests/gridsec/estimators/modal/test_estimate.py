@@ -103,7 +103,7 @@ def test_a_mixture_contains_the_disagreement() -> None:
     problem = SearchProblem(np.array([50.0, 50.0]), F, np.ones(2), 2, np.zeros(2), np.full(2, np.inf))
     chosen = np.array([[True, False], [False, True]])
     found = Identification(chosen, np.zeros(2, np.intp), np.array([0.5, 0.5]), np.zeros(2, bool), (problem,))
-    before = estimate.Estimated(np.zeros(1), np.array([1e-4]))
+    before = estimate.Estimated(np.zeros(1), lambda: np.array([1e-4]))
     after = estimate.corrected([before], [np.array([[1.0, -1.0]])], found)
     f, own = 50.0 / 101.0, 1.0 / 101.0
     assert np.allclose(after.mean, 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle  # the states of this test only
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -52,6 +53,26 @@ def test_named_meters_are_masked_and_released(kernel: Core, share: float) -> Non
     assert len(alarms) < 30
     truth = abs(core.estimate(kernel, state).mean[MODEL.meters[SECOND]])
     assert truth < 0.02
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2])
+@pytest.mark.parametrize("ticks", [205, 240])
+def test_a_replay_from_a_late_state_equals_one_from_the_first(kernel: Core, share: float, ticks: int) -> None:
+    """State, log M and kept readings after masking 5 and 40 ticks after the onset."""
+    source, random = Source(MODEL, np.random.default_rng(1)), np.random.default_rng(2)
+    state = core.init(kernel, 0.0)
+    for k in range(ticks):
+        seen = random.random(12) >= share
+        state, evidence = core.step(kernel, state, float(k), source.tick() + lie(k), seen)
+    suspicion = core.identify(kernel, state, evidence)
+    assert suspicion.found.named.any()
+    whole = replace(state.history, middle=None, recent=())
+    one, two = (core.mask(kernel, replace(state, history=each), suspicion) for each in (state.history, whole))
+    assert one[1].log_m == pytest.approx(two[1].log_m, abs=1e-9)
+    assert (core.estimate(kernel, one[0]).mean == core.estimate(kernel, two[0]).mean).all()
+    assert len(one[0].history.readings) == len(two[0].history.readings)
+    assert [each[0] for each in one[0].history.recent] == [each[0] for each in two[0].history.recent]
+    assert (one[0].history.middle is None) == (two[0].history.middle is None)
 
 
 def test_an_onset_older_than_the_kept_readings_is_masked(kernel: Core) -> None:

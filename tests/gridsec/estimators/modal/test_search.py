@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from math import comb
 
@@ -81,10 +82,18 @@ def test_costs_changes_and_exchanges_are_exact(seed: int) -> None:
         if free.size:
             other = tableau.chosen.copy()
             other[free] = True
-            change = tableau.group(np.arange(given.meters)[None], other[None, : given.meters])
-            same = free.size > 1
-            assert not same or tableau.cost + change[0] == pytest.approx(s.cost(given, other), abs=1e-7)
-            assert same or np.isinf(change[0])
+            change = tableau.group(np.arange(given.meters)[None], other[None, : given.meters])[0]
+            for n, found in enumerate(change):
+                some = np.append(other[: n + 1], np.zeros(other.size - n - 1, dtype=np.bool_))
+                some |= tableau.chosen
+                several = np.count_nonzero(some & ~tableau.chosen) > 1
+                assert not several or tableau.cost + found == pytest.approx(s.cost(given, some), abs=1e-7)
+                assert several or np.isinf(found)
+    some = random.random((5, given.meters)) < 0.5
+    changes = tableau.toggled(np.tile(np.arange(given.meters), (5, 1)), some)
+    for each, change in zip(some, changes, strict=True):
+        other = tableau.chosen ^ np.append(each, np.zeros(given.y.size - given.meters, dtype=np.bool_))
+        assert tableau.cost + change == pytest.approx(s.cost(given, other), abs=1e-7)
     assert np.isfinite(tableau.A).all()
     again = Tableau(given).pivot(tableau.chosen)
     assert np.allclose(again.A, tableau.A, atol=1e-8 * np.abs(tableau.A).max())
@@ -119,6 +128,26 @@ def test_costs_of_many_sets_are_those_of_each(seed: int) -> None:
     given, random = problem(seed), np.random.default_rng(seed)
     sets = random.random((30, given.y.size)) < np.linspace(0.0, 0.9, 30)[:, None]
     assert np.allclose(s.costs(given, sets), [s.cost(given, each) for each in sets], atol=1e-8)
+    with_some = sets | np.isin(np.arange(given.y.size), [1, 2, 9])
+    assert np.allclose(s.costs(given, with_some), [s.cost(given, each) for each in with_some], atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_costs_of_amounts_alike_are_exact(seed: int) -> None:
+    """A share of the variance in common; sets with nothing, and with three faults, that all of them have."""
+    given, random, p = problem(seed), np.random.default_rng(seed), 8
+    given = replace(given, std=random.uniform(0.5, 2.0, given.y.size))
+    sets = random.random((20, given.y.size)) < 0.5
+    for some in (sets, sets | np.isin(np.arange(given.y.size), [1, 2, 9])):
+        for chosen, found in zip(some, s.costs(given, some, s.ALIKE), strict=True):
+            at = np.flatnonzero(chosen)
+            alike = np.where(np.equal.outer(at, at), 1.0, s.ALIKE) * np.logical_and.outer(at < p, at < p)
+            V = np.outer(given.std[at], given.std[at]) * np.where(np.equal.outer(at, at), 1.0, alike)
+            F, y = given.F[np.ix_(at, at)], given.y[at]
+            exact = np.linalg.slogdet(np.eye(at.size) + V @ F)[1]
+            exact -= y @ np.linalg.solve(np.eye(at.size) + V @ F, V @ y)
+            exact += s.penalties(p)[np.count_nonzero(at < p)] + given.charge[at].sum() + given.charge.max()
+            assert found == pytest.approx(exact, abs=1e-7)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -183,6 +212,13 @@ def test_honest_scores_name_nothing() -> None:
     assert named <= 2
 
 
+@pytest.mark.parametrize("some", [(), (1,), (0, 3, 9)])
+def test_mean_amounts_are_those_of_the_posterior(some: tuple[int, ...]) -> None:
+    given = problem(2)
+    chosen = np.isin(np.arange(given.y.size), some)
+    assert np.allclose(s.mean_amounts(given, chosen), s.amounts(given, chosen)[0], atol=1e-9)
+
+
 def test_impossible_amounts_are_not_chosen() -> None:
     """A power that would have to be beyond its bound is left out, and a meter explains it."""
     F = np.array([[50.0, 49.0], [49.0, 50.0]])
@@ -204,6 +240,20 @@ def test_amounts_that_become_impossible_are_removed() -> None:
     end = s.descend(tableau)
     amount = s.amounts(tight, end.chosen)[0]
     assert (np.abs(amount) <= tight.bound[end.chosen]).all()
+
+
+def test_sequences_contain_every_group_once() -> None:
+    """Nested groups, and groups that overlap: each is the beginning of one sequence."""
+    made = modes(busbar())
+    for some in (s.groups(made), (np.array([1, 2, 3]), np.array([2, 3, 4]), np.array([2, 3])), ()):
+        found = [
+            frozenset(members[k, : n + 1].tolist())
+            for members, inside, ends in s.together(some)
+            for k, n in zip(*np.nonzero(ends), strict=True)
+            if inside[k, : n + 1].all()
+        ]
+        assert len(found) == len(some)
+        assert set(found) == {frozenset(each.tolist()) for each in some}
 
 
 def test_groups_are_nested_and_cover_neighbours() -> None:
