@@ -21,13 +21,14 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid, Problem
-from gridsec.estimators.modal import detector, full, masking, replay, rivals, signatures, static
+from gridsec.estimators.modal import detector, full, masking, mirrors, replay, rivals, signatures, static
 from gridsec.estimators.modal import estimate as estimates
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.detector import SIZE, Detector, Evidence
 from gridsec.estimators.modal.estimate import Estimated, Estimator
 from gridsec.estimators.modal.filter import FilterState, Update
 from gridsec.estimators.modal.masking import Masked
+from gridsec.estimators.modal.mirrors import Neighbourhoods
 from gridsec.estimators.modal.model import Modes, ResidualModel, modes, residual_model
 from gridsec.estimators.modal.replay import History, Parts, Suspected
 from gridsec.estimators.modal.rivals import Rival
@@ -68,8 +69,8 @@ class Core:
         Change of the model at every place by each fault: meters (none), false active powers, busbar.
     faults
         Columns of all faults. False reactive powers are left out: they move voltages nearly as active ones.
-    groups
-        Groups of neighbours, for the search.
+    groups, near
+        Groups of neighbours, for the search, and neighbourhoods, for mirror images of explanations.
     estimator
         Regression of all places on the modes.
     bound : (q,)
@@ -85,6 +86,7 @@ class Core:
     effect: Floats = field(repr=False)
     faults: Columns = field(repr=False)
     groups: tuple[Ints, ...] = field(repr=False)
+    near: Neighbourhoods = field(repr=False)
     estimator: Estimator = field(repr=False)
     bound: Floats = field(repr=False)
     limit: float
@@ -121,7 +123,9 @@ class CoreState:
     rivals: tuple[Rival, ...] = ()
 
 
-def assemble(model: ResidualModel, powers: Floats, most: Floats, *, gamma: float) -> Core:
+def assemble(
+    model: ResidualModel, powers: Floats, most: Floats, *, gamma: float, attacked: int | None = None
+) -> Core:
     """Prepare a core.
 
     Parameters
@@ -134,6 +138,8 @@ def assemble(model: ResidualModel, powers: Floats, most: Floats, *, gamma: float
         Largest active powers that the customers can have, pu.
     gamma
         Least average number of ticks from one false alarm to the next, at least 1.
+    attacked
+        Largest number of manipulated meters that is promised; None: a third.
 
     Raises
     ------
@@ -151,6 +157,7 @@ def assemble(model: ResidualModel, powers: Floats, most: Floats, *, gamma: float
         effect=np.hstack([np.zeros((len(powers), at.size)), powers, model.busbar_of[:, used]]),
         faults=signatures.columns(made, powers[at], std, SIZE),
         groups=groups(made),
+        near=mirrors.neighbourhoods(made, max(1, at.size // 3) if attacked is None else attacked),
         estimator=estimates.estimator(made),
         bound=np.concatenate([np.full(at.size, inf), MOST_POWER * most, np.full(int(used.sum()), inf)]),
         limit=log(gamma),
@@ -172,7 +179,7 @@ def design(front: SequentialDesign, most: Floats | None = None) -> Core:
     most = np.full(every.size, CONNECTION) if most is None else most
     powers = front.sensitivities.columns(Power.ACTIVE, every)
     gamma = max(1.0, YEAR_S / (front.step_s * front.options.alarms_per_year))
-    return assemble(residual_model(front), powers, most, gamma=gamma)
+    return assemble(residual_model(front), powers, most, gamma=gamma, attacked=front.max_attacked)
 
 
 def residuals(state: SequentialState) -> tuple[Floats, Bools]:
@@ -403,7 +410,7 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     best = int(np.argmin(costs))
     if best:
         found = _searched(core, state, rows[best])
-    return Suspicion(rows[best], found)
+    return Suspicion(rows[best], mirrors.reflected(found, core.near))
 
 
 def _parts(state: CoreState) -> Parts:
