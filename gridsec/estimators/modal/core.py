@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, replace
 from math import inf, log
 
 import numpy as np
+from scipy.linalg import cholesky, solve_triangular
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid, Problem
@@ -51,6 +52,8 @@ CONNECTION = 0.1
 """Power of a customer where the files are not asked, pu of the feeder's base: 10 kW at 100 kVA."""
 FARTHER = 5.0
 """Log M of an onset above that of all pinned ones from which on it replaces them, 1; a replay takes time."""
+LASTS = 0.2
+"""Standard deviation of a lasting error along an unknown direction, in that of one tick of the filter, 1."""
 CALM = 0.5
 """Part of the limit of log M below which suspected onsets are given up, 1."""
 
@@ -402,15 +405,19 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     rows = [] if state.suspected else [int(evidence.rows[0])]
     rows = list(dict.fromkeys(rows + np.flatnonzero(test.pinned & test.onsets.used).tolist()))
     found = _searched(core, state, rows[0])
-    std = found.problems[0].std
-    costs = [
-        cost(replace(_problem(core, _joint(core, _parts(state), row)), std=std), found.chosen[0])
-        for row in rows
-    ]
+    std, costs = found.problems[0].std, []
+    for row in rows:
+        problem, gain = _problem(core, _joint(core, _parts(state), row), _unknown(state))
+        costs.append(cost(replace(problem, std=std), found.chosen[0]) - 2.0 * gain)
     best = int(np.argmin(costs))
     if best:
         found = _searched(core, state, rows[best])
     return Suspicion(rows[best], mirrors.reflected(found, core.near))
+
+
+def _unknown(state: CoreState) -> Floats | None:
+    """Unknown directions of the last tick, (p, k)."""
+    return state.history.readings[-1][3] if state.history.readings else None
 
 
 def _parts(state: CoreState) -> Parts:
@@ -428,25 +435,42 @@ def _joint(core: Core, parts: Parts, row: int) -> Joint:
 
 def _searched(core: Core, state: CoreState, row: int) -> Identification:
     """Explanations since one onset, under the model and under its rivals."""
-    model = _problem(core, _joint(core, _parts(state), row))
+    open_ = _unknown(state)
+    model, gain = _problem(core, _joint(core, _parts(state), row), open_)
     if not state.rivals:
         return search(model, core.groups)
     plain, others = state.rivals[0], state.rivals[1:]
     less = 2.0 * log(PRIOR * len(others) / (1.0 - PRIOR))
-    costs = [2.0 * (plain.evidence - each.evidence) + less for each in others]
-    problems = [_problem(core, each.joint()) for each in others]
-    return search(model, core.groups, list(zip(problems, costs, strict=True)))
+    found = []
+    for each in others:
+        problem, more = _problem(core, each.joint(), open_)
+        found.append((problem, 2.0 * (plain.evidence + gain - each.evidence - more) + less))
+    return search(model, core.groups, found)
 
 
-def _problem(core: Core, joint: Joint) -> SearchProblem:
-    """Scores, information and charges of all faults at one onset."""
-    faults, p = core.faults, core.modes.size
-    y, F = joint.of(faults.W)
+def _problem(core: Core, joint: Joint, unknown: Floats | None) -> tuple[SearchProblem, float]:
+    """Scores, information and charges of all faults at one onset, and the gain of evidence by unknown errors.
+
+    The filter takes the error along an unknown direction as white. One that lasts since the onset would count
+    against a set of faults at every tick. Its amount, N(0, `LASTS`^2) of the direction, is integrated out:
+    with scores y and information F of faults and directions n,
+
+        M = F_nn + 1,  y - F_n M^-1 y_n,  F - F_n M^-1 F_n',  gain = (y_n' M^-1 y_n - log det M) / 2
+    """
+    faults, p, q = core.faults, core.modes.size, core.faults.std.size
+    W = faults.W if unknown is None else np.hstack([faults.W, LASTS * (core.modes.U.T @ unknown)])
+    y, F = joint.of(W)
+    gain = 0.0
+    if unknown is not None:
+        half = cholesky(F[q:, q:] + np.eye(len(y) - q), lower=True)
+        white = solve_triangular(half, np.hstack([F[q:, :q], y[q:, None]]), lower=True)
+        y, F = y[:q] - white[:, :q].T @ white[:, q], F[:q, :q] - white[:, :q].T @ white[:, :q]
+        gain = 0.5 * float(white[:, q] @ white[:, q]) - float(np.log(half.diagonal()).sum())
     accusation = 2.0 * log(p)
-    charge = np.zeros(y.size)
+    charge = np.zeros(q)
     charge[p:] = accusation
     charge[p : p + faults.powers] = ACCUSATIONS * accusation
-    return SearchProblem(y, F, faults.std, p, charge, core.bound)
+    return SearchProblem(y, F, faults.std, p, charge, core.bound), gain
 
 
 def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -> Estimated:
