@@ -19,16 +19,18 @@ from dataclasses import dataclass, field, replace
 from math import inf, log
 
 import numpy as np
+from scipy.linalg import cholesky, solve_triangular
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid, Problem
-from gridsec.estimators.modal import detector, full, masking, replay, rivals, signatures, static
+from gridsec.estimators.modal import detector, full, masking, mirrors, replay, rivals, signatures, static
 from gridsec.estimators.modal import estimate as estimates
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.detector import SIZE, Detector, Evidence
 from gridsec.estimators.modal.estimate import Estimated, Estimator
 from gridsec.estimators.modal.filter import FilterState, Update
 from gridsec.estimators.modal.masking import Masked
+from gridsec.estimators.modal.mirrors import Neighbourhoods
 from gridsec.estimators.modal.model import Modes, ResidualModel, modes, residual_model
 from gridsec.estimators.modal.replay import History, Parts, Suspected
 from gridsec.estimators.modal.rivals import Rival
@@ -51,6 +53,8 @@ CONNECTION = 0.1
 """Power of a customer where the files are not asked, pu of the feeder's base: 10 kW at 100 kVA."""
 FARTHER = 5.0
 """Log M of an onset above that of all pinned ones from which on it replaces them, 1; a replay takes time."""
+LASTS = 0.2
+"""Standard deviation of a lasting error along an unknown direction, in that of one tick of the filter, 1."""
 CALM = 0.5
 """Part of the limit of log M below which suspected onsets are given up, 1."""
 
@@ -69,8 +73,8 @@ class Core:
         Change of the model at every place by each fault: meters (none), false active powers, busbar.
     faults
         Columns of all faults. False reactive powers are left out: they move voltages nearly as active ones.
-    groups
-        Groups of neighbours, for the search.
+    groups, near
+        Groups of neighbours, for the search, and neighbourhoods, for mirror images of explanations.
     estimator
         Regression of all places on the modes.
     bound : (q,)
@@ -86,6 +90,7 @@ class Core:
     effect: Floats = field(repr=False)
     faults: Columns = field(repr=False)
     groups: tuple[Ints, ...] = field(repr=False)
+    near: Neighbourhoods = field(repr=False)
     estimator: Estimator = field(repr=False)
     bound: Floats = field(repr=False)
     limit: float
@@ -122,7 +127,9 @@ class CoreState:
     rivals: tuple[Rival, ...] = ()
 
 
-def assemble(model: ResidualModel, powers: Floats, most: Floats, *, gamma: float) -> Core:
+def assemble(
+    model: ResidualModel, powers: Floats, most: Floats, *, gamma: float, attacked: int | None = None
+) -> Core:
     """Prepare a core.
 
     Parameters
@@ -135,6 +142,8 @@ def assemble(model: ResidualModel, powers: Floats, most: Floats, *, gamma: float
         Largest active powers that the customers can have, pu.
     gamma
         Least average number of ticks from one false alarm to the next, at least 1.
+    attacked
+        Largest number of manipulated meters that is promised; None: a third.
 
     Raises
     ------
@@ -152,6 +161,7 @@ def assemble(model: ResidualModel, powers: Floats, most: Floats, *, gamma: float
         effect=np.hstack([np.zeros((len(powers), at.size)), powers, model.busbar_of[:, used]]),
         faults=signatures.columns(made, powers[at], std, SIZE),
         groups=groups(made),
+        near=mirrors.neighbourhoods(made, max(1, at.size // 3) if attacked is None else attacked),
         estimator=estimates.estimator(made),
         bound=np.concatenate([np.full(at.size, inf), MOST_POWER * most, np.full(int(used.sum()), inf)]),
         limit=log(gamma),
@@ -173,7 +183,7 @@ def design(front: SequentialDesign, most: Floats | None = None) -> Core:
     most = np.full(every.size, CONNECTION) if most is None else most
     powers = front.sensitivities.columns(Power.ACTIVE, every)
     gamma = max(1.0, YEAR_S / (front.step_s * front.options.alarms_per_year))
-    return assemble(residual_model(front), powers, most, gamma=gamma)
+    return assemble(residual_model(front), powers, most, gamma=gamma, attacked=front.max_attacked)
 
 
 def residuals(state: SequentialState) -> tuple[Floats, Bools]:
@@ -430,12 +440,19 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     found = _searched(core, state, rows[0])
     best = 0
     if len(rows) > 1:
-        std, chosen = found.problems[0].std, found.chosen[0]
-        each = [_problem(core, _joint(core, _parts(state), row), chosen) for row in rows]
-        best = int(np.argmin([cost(replace(one, std=std), chosen) for one in each]))
+        std, chosen, costs = found.problems[0].std, found.chosen[0], []
+        for row in rows:
+            problem, gain = _problem(core, _joint(core, _parts(state), row), _unknown(state), chosen)
+            costs.append(cost(replace(problem, std=std), chosen) - 2.0 * gain)
+        best = int(np.argmin(costs))
     if best:
         found = _searched(core, state, rows[best])
-    return Suspicion(rows[best], found)
+    return Suspicion(rows[best], mirrors.reflected(found, core.near))
+
+
+def _unknown(state: CoreState) -> Floats | None:
+    """Unknown directions of the last tick, (p, k)."""
+    return state.history.readings[-1][3] if state.history.readings else None
 
 
 def _parts(state: CoreState) -> Parts:
@@ -453,29 +470,50 @@ def _joint(core: Core, parts: Parts, row: int) -> Joint:
 
 def _searched(core: Core, state: CoreState, row: int) -> Identification:
     """Explanations since one onset, under the model and under its rivals."""
-    model = _problem(core, _joint(core, _parts(state), row))
+    open_ = _unknown(state)
+    model, gain = _problem(core, _joint(core, _parts(state), row), open_)
     if not state.rivals:
         return search(model, core.groups)
     plain, others = state.rivals[0], state.rivals[1:]
     less = 2.0 * log(PRIOR * len(others) / (1.0 - PRIOR))
-    costs = [2.0 * (plain.evidence - each.evidence) + less for each in others]
-    problems = [_problem(core, each.joint()) for each in others]
-    return search(model, core.groups, list(zip(problems, costs, strict=True)))
+    found = []
+    for each in others:
+        problem, more = _problem(core, each.joint(), open_)
+        found.append((problem, 2.0 * (plain.evidence + gain - each.evidence - more) + less))
+    return search(model, core.groups, found)
 
 
-def _problem(core: Core, joint: Joint, only: Bools | None = None) -> SearchProblem:
-    """Scores, information and charges of all faults at one onset; zero beside the faults `only` (q,)."""
-    faults, p = core.faults, core.modes.size
-    if only is None:
-        y, F = joint.of(faults.W)
-    else:
-        y, F = np.zeros(only.size), np.zeros((only.size, only.size))
-        y[only], F[np.ix_(only, only)] = joint.of(faults.W[:, only])
+def _problem(
+    core: Core, joint: Joint, unknown: Floats | None, only: Bools | None = None
+) -> tuple[SearchProblem, float]:
+    """Scores, information and charges of all faults at one onset, and the gain of evidence by unknown errors.
+
+    Scores and information are zero beside the faults `only` (q,). The filter takes the error along an unknown
+    direction as white. One that lasts since the onset would count against a set of faults at every tick. Its
+    amount, N(0, `LASTS`^2) of the direction, is integrated out: with scores y and information F of faults and
+    directions n,
+
+        M = F_nn + 1,  y - F_n M^-1 y_n,  F - F_n M^-1 F_n',  gain = (y_n' M^-1 y_n - log det M) / 2
+    """
+    faults, p, q = core.faults, core.modes.size, core.faults.std.size
+    W = faults.W if only is None else faults.W[:, only]
+    m, gain = W.shape[1], 0.0
+    if unknown is not None:
+        W = np.hstack([W, LASTS * (core.modes.U.T @ unknown)])
+    y, F = joint.of(W)
+    if unknown is not None:
+        half = cholesky(F[m:, m:] + np.eye(len(y) - m), lower=True)
+        white = solve_triangular(half, np.hstack([F[m:, :m], y[m:, None]]), lower=True)
+        y, F = y[:m] - white[:, :m].T @ white[:, m], F[:m, :m] - white[:, :m].T @ white[:, :m]
+        gain = 0.5 * float(white[:, m] @ white[:, m]) - float(np.log(half.diagonal()).sum())
+    if only is not None:
+        few, y, F = (y, F), np.zeros(q), np.zeros((q, q))
+        y[only], F[np.ix_(only, only)] = few
     accusation = 2.0 * log(p)
-    charge = np.zeros(y.size)
+    charge = np.zeros(q)
     charge[p:] = accusation
     charge[p : p + faults.powers] = ACCUSATIONS * accusation
-    return SearchProblem(y, F, faults.std, p, charge, core.bound)
+    return SearchProblem(y, F, faults.std, p, charge, core.bound), gain
 
 
 def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -> Estimated:

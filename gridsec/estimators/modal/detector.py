@@ -43,6 +43,7 @@ from dataclasses import dataclass, replace
 from math import inf, log, sqrt
 
 import numpy as np
+from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.estimators.modal import signatures
@@ -167,7 +168,8 @@ def step(
     """Take in one step of the filter and evaluate M, if that is due.
 
     All onsets are evaluated at every `EVERY`-th tick. Young and pinned ones are evaluated at every tick while
-    an onset is pinned, while log M was above `alert`, and where one innovation stands out by itself. The
+    an onset is pinned, while log M was above `alert`, and where one innovation stands out by itself. Powers
+    are evaluated at every `EVERY`-th tick and while an onset is pinned: an alarm by them alone lasts. The
     choice may depend on the readings: what is left out only makes M smaller.
 
     Parameters
@@ -192,14 +194,15 @@ def step(
         begun.append(_STEPS + int(free[_STEPS:].argmin()))
         capital[:, begun[1]] = log(RAMPS * RAMP_EVERY)
     onsets = signatures.follow(modes, before.onsets, update, static, h, begun=begun, ended=ended)
-    full, none = ticks % EVERY == 0, np.full(capital.shape, -inf)
-    if not (full or before.log_m >= alert or before.pinned.any() or _stands_out(modes, update, static)):
+    full, none, suspected = ticks % EVERY == 0, np.full(capital.shape, -inf), bool(before.pinned.any())
+    if not (full or before.log_m >= alert or suspected or _stands_out(modes, update, static)):
         return Detector(onsets, capital, ticks, None, before.pinned, before.log_m), Evidence(-inf, none)
     young = (onsets.age <= YOUNG) & ~onsets.ramp
     due = onsets.used if full else onsets.used & (young | before.pinned)
     rows = np.flatnonzero(due)
     ratio = none
-    ratio[:, rows] = log_ratios(columns, modes, signatures.scores(modes, onsets, static, rows), full)
+    now = signatures.scores(modes, onsets, static, rows)
+    ratio[:, rows] = log_ratios(columns, modes, now, full or suspected)
     by_row = capital + _LOG_WEIGHTS + ratio
     if due[_STEPS:].any():
         # A ramp has its capital at the last tick of those that it stands for.
@@ -211,14 +214,27 @@ def step(
 
 
 def _stands_out(modes: Modes, update: Update, static: Static) -> bool:
-    """A member, or all of them together, stand out in one innovation."""
-    score, v = static.score, update.variance
-    y, F = modes.U @ score, modes.squares @ (1.0 / v)
-    count = modes.size if update.seen is None else int(np.count_nonzero(update.seen))
-    return bool((y * y > JUMP * F).any() or score @ (v * score) > count + sqrt(2.0 * JUMP * count))
+    """A member, a phase of the busbar, or all of them together, stand out in one innovation."""
+    score, v, W = static.score, update.variance, modes.phases
+    if update.exact is not None:
+        n, half, white = update.exact.rows, update.exact.half, update.exact.white
+        sigma, F, count, misfit = modes.U @ score, update.exact.precision, n.size, float(white @ white)
+        felt, _ = lapack.dtrtrs(half, W[n], lower=True) if n.size else (W[n], 0)
+        of_busbar = (felt * felt).sum(axis=0)
+    else:
+        sigma, F, count, misfit = (
+            modes.U @ score,
+            modes.squares @ (1.0 / v),
+            v.size,
+            float(score @ (v * score)),
+        )
+        of_busbar = ((modes.U.T @ W) ** 2).T @ (1.0 / v)
+    y = np.concatenate([sigma, sigma @ W])
+    F = np.concatenate([F, of_busbar])
+    return bool((y * y > JUMP * F).any() or misfit > count + sqrt(2.0 * JUMP * count))
 
 
-def log_ratios(columns: Columns, modes: Modes, now: Scores, full: bool) -> Floats:
+def log_ratios(columns: Columns, modes: Modes, now: Scores, powers: bool) -> Floats:
     """Log Lambda of each kind and row, (3, k).
 
     Parameters
@@ -227,18 +243,21 @@ def log_ratios(columns: Columns, modes: Modes, now: Scores, full: bool) -> Float
         The columns, and the modes.
     now
         Scores and information.
-    full
-        Evaluate powers and busbar as well; else their row is -inf.
+    powers
+        Evaluate the powers as well; else they count as 0.
     """
-    t = columns.members
-    out = np.full((3, len(now.score)), -inf)
-    W, squares = (columns.W, columns.squares) if full else (columns.W[:, :t], columns.squares[:, :t])
+    t, out = columns.members, np.full((3, len(now.score)), -inf)
+    W, squares, variance = columns.W, columns.squares, columns.variance
+    if not powers:
+        W, squares, variance = columns.without_powers
     y, F = now.of(W, squares)
-    each = log_lambda(y, F, columns.variance[: W.shape[1]])
+    if now.busbar is not None:
+        F[:, F.shape[1] - now.busbar.shape[1] :] = now.busbar
+    each = log_lambda(y, F, variance)
     out[0] = _log_mean(each[:, :t])
     out[1] = omnibus(now, SIZE**2 / modes.white)
-    if full:
-        out[2] = _log_mean(each[:, t:])
+    if W.shape[1] > t:
+        out[2] = _log_mean(each[:, t:]) + log((W.shape[1] - t) / (columns.std.size - t))
     return out
 
 

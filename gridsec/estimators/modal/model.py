@@ -270,6 +270,12 @@ class Modes:
         """Covariance B of the members, (t, t)."""
         return self.model.static(self.at)
 
+    @cached_property
+    def phases(self) -> Floats:
+        """Incidence of the members and those phases of the busbar that have any, (t, b)."""
+        H = self.model.phases(self.at)
+        return H[:, H.any(axis=0)]
+
     @property
     def size(self) -> int:
         """Number of members and of modes, t."""

@@ -350,7 +350,6 @@ def _identified(design: ModalDesign, state: ModalState, evidence: Evidence) -> t
     if tick < state.due or not core.alarmed(kernel, evidence):
         return replace(state, suspicion=suspicion), evidence
     suspicion = core.identify(kernel, state.core, evidence)
-    suspicion = verdict.with_complements(kernel, suspicion, design.max_attacked)
     named = suspicion.found.named & ~state.core.masked.meters
     streak = np.where(named, state.streak + 1, 0)
     phases = np.where(verdict.certain_phases(kernel, suspicion), state.phases + 1, 0)

@@ -158,6 +158,12 @@ def penalties(meters: int) -> Floats:
     return frozen(np.concatenate([[0.0], np.cumsum(more)]))
 
 
+def penalty(problem: SearchProblem, chosen: Bools) -> float:
+    """Penalty of one set, (q,)."""
+    count = int(np.count_nonzero(chosen[: problem.meters]))
+    return float(penalties(problem.meters)[count] + problem.charge[chosen].sum())
+
+
 def cost(problem: SearchProblem, chosen: Bools) -> float:
     """Cost of one set; O(k^3).
 
@@ -169,7 +175,7 @@ def cost(problem: SearchProblem, chosen: Bools) -> float:
         The set.
     """
     at = np.flatnonzero(chosen)
-    out = float(penalties(problem.meters)[np.count_nonzero(at < problem.meters)] + problem.charge[at].sum())
+    out = penalty(problem, chosen)
     if at.size:
         half = cholesky(problem.F[np.ix_(at, at)] + np.diag(problem.std[at] ** -2.0), lower=True)
         out -= float(problem.y[at] @ cho_solve((half, True), problem.y[at]))
@@ -923,14 +929,14 @@ def _identified(problems: tuple[SearchProblem, ...], found: tuple[dict[bytes, fl
 
 
 def groups(modes: Modes) -> tuple[Ints, ...]:
-    """Nested groups of neighbours: clusters of members by the correlation of their voltages, O(t^2 log t).
+    """Groups of neighbours of at most half of the members."""
+    return tuple(each for each in clusters(modes) if each.size <= modes.size // 2)
+
+
+def clusters(modes: Modes) -> tuple[Ints, ...]:
+    """Nested clusters of members by the correlation of their voltages, O(t^2 log t); the last has all.
 
     Any network has them; on a radial feeder they are nearly the subtrees.
-
-    Parameters
-    ----------
-    modes
-        The modes.
     """
     if modes.size < _FEWEST:
         return ()
@@ -942,8 +948,7 @@ def groups(modes: Modes) -> tuple[Ints, ...]:
     inside: list[Ints] = [np.array([k]) for k in range(modes.size)]
     for one, other in tree[:, :2].astype(np.intp):
         inside.append(np.sort(np.concatenate([inside[one], inside[other]])))
-    most = modes.size // 2
-    return tuple(each for each in inside[modes.size :] if each.size <= most)
+    return tuple(inside[modes.size :])
 
 
 _FEWEST = 3

@@ -27,7 +27,9 @@ readings; k is the gain ``slower``. So y of a column x_t is a martingale with th
 E' x_t``, E selecting the readings. v is that of complete readings, ``E V^-1 E' <= diag(1 / v)``. So I is an
 upper bound, and the mean of ``exp(y f - I f^2 / 2)`` is at most 1. For single members the bound is lowered,
 ``lost``: the part of a fault that the member itself feels counts with the exact ``(V^-1)_jj`` in place of
-``(U diag(1 / v) U')_jj``, 0 without a reading. That is exact for white errors.
+``(U diag(1 / v) U')_jj``, 0 without a reading. That is exact for white errors. The information about the
+phases of the busbar is exact, ``busbar``. An unknown direction near a common shift, as an unread power at the
+head of a feeder, takes nearly all of it: by the bound, such a shift would leave no evidence.
 
 References
 ----------
@@ -38,10 +40,11 @@ systems, IEEE Trans. Automatic Control 21, 1976.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import blas
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.estimators.modal.filter import Update
@@ -73,6 +76,8 @@ class Onsets:
         Score of the exact innovation, i and c.
     lost : (k, t) or None
         Part of i at each member that was not read; None where nothing is missing since the filter is modal.
+    busbar : (k, b) or None
+        Exact information about the phases of the busbar, likewise.
     """
 
     age: Ints
@@ -84,6 +89,7 @@ class Onsets:
     information: Floats = field(repr=False)
     cross: Floats = field(repr=False)
     lost: Floats | None = field(default=None, repr=False)
+    busbar: Floats | None = field(default=None, repr=False)
 
 
 def empty(modes: Modes, steps: int, ramps: int = 0) -> Onsets:
@@ -119,7 +125,7 @@ def single(onsets: Onsets, row: int) -> Onsets:
     onsets, row
         The onsets, and the row.
     """
-    at, lost = slice(row, row + 1), onsets.lost
+    at, lost, busbar = slice(row, row + 1), onsets.lost, onsets.busbar
     return Onsets(
         onsets.age[at],
         onsets.used[at],
@@ -130,6 +136,7 @@ def single(onsets: Onsets, row: int) -> Onsets:
         onsets.information[at],
         onsets.cross[at],
         None if lost is None else lost[at],
+        None if busbar is None else busbar[at],
     )
 
 
@@ -175,7 +182,7 @@ def follow(
     score -= onsets.cross * static.moved
     score += onsets.score
     information = weighed * gamma
-    lost = _lost(modes, onsets, update, gamma)
+    lost, busbar = _lost(modes, onsets, update, gamma), _busbar(modes, onsets, update, static, gamma)
     information += onsets.information
     cross = weighed * static.gamma
     cross += onsets.cross
@@ -184,7 +191,9 @@ def follow(
         g[:, row] = score[row] = information[row] = cross[row] = 0.0
         if lost is not None:
             lost[row] = 0.0
-    return Onsets(age + used, used, onsets.ramp, level, g, score, information, cross, lost)
+        if busbar is not None:
+            busbar[row] = 0.0
+    return Onsets(age + used, used, onsets.ramp, level, g, score, information, cross, lost, busbar)
 
 
 def _lost(modes: Modes, onsets: Onsets, update: Update, gamma: Floats) -> Floats | None:
@@ -202,6 +211,33 @@ def _lost(modes: Modes, onsets: Onsets, update: Update, gamma: Floats) -> Floats
     return own if onsets.lost is None else own + onsets.lost
 
 
+def _busbar(modes: Modes, onsets: Onsets, update: Update, static: Static, gamma: Floats) -> Floats | None:
+    """Exact information about the phases of the busbar, that of one tick included, (k, b).
+
+    The score of a phase moves by ``x' s``, ``x = gamma W - gamma_0 Gamma N Gamma' c W`` in the modes. Its
+    information is ``x_n' V^-1 x_n``, with V of the readings n and the unknown directions of the tick.
+    """
+    if update.exact is None:
+        return None
+    W, rows, G = modes.U.T @ modes.phases, update.exact.rows, modes.directions
+    turn, before = np.einsum("kt,tr,tb->krb", onsets.cross, G, W, optimize=True), onsets.busbar
+    if before is None:
+        # The first tick without the modes: what is known of theta is that before it.
+        earlier = replace(static, information=static.information - static.gamma**2 / update.variance)
+        known = np.einsum("krb,rs,ksb->kb", turn, current(modes, earlier).cov, turn, optimize=True)
+        before = np.asarray(onsets.information @ (W * W) - known)
+    if not rows.size:
+        return before.copy()
+    x = gamma[:, :, None] * W
+    if modes.sign.size:
+        few = modes.sign.size <= FEW
+        cov = static.cov if few else of_busbar(modes, static)
+        x -= (static.gamma[:, None] * G[:, : len(cov)]) @ (cov @ turn[:, : len(cov)])
+    felt = np.einsum("nt,ktb->nkb", modes.back[rows], x, optimize=True).reshape(rows.size, -1)
+    white = blas.dtrsm(1.0, update.exact.half, felt, lower=1)
+    return np.asarray(before + (white * white).sum(axis=0).reshape(before.shape))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Scores:
     """Scores and information of all modes with theta integrated out. k rows, t modes, r directions in use.
@@ -216,6 +252,8 @@ class Scores:
         Their N.
     share : (k, t) or None
         Share of the information that was read at each member; None for 1.
+    busbar : (k, b) or None
+        Exact information about the phases of the busbar; None where ``information`` is exact.
     """
 
     score: Floats
@@ -223,6 +261,7 @@ class Scores:
     side: Floats
     cov: Floats
     share: Floats | None = None
+    busbar: Floats | None = None
 
     def of(self, W: Floats, squares: Floats) -> tuple[Floats, Floats]:
         """Scores and information of single columns, (k, q) each.
@@ -256,12 +295,14 @@ def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _A
     r = modes.sign.size
     score, information = onsets.score[rows], onsets.information[rows]
     share = None if onsets.lost is None else _share(modes, information, onsets.lost[rows])
+    busbar = None if onsets.busbar is None else onsets.busbar[rows]
     if not r:
-        return Scores(score, information, np.zeros((len(score), 0, modes.size)), np.zeros((0, 0)), share)
+        none = np.zeros((len(score), 0, modes.size)), np.zeros((0, 0))
+        return Scores(score, information, *none, share, busbar)
     cross, G, cov = onsets.cross[rows], modes.directions, static.cov
     if r > FEW:
         G, cov = G[:, : modes.busbar], of_busbar(modes, static)
-    return Scores(score, information, cross[:, None, :] * G.T, cov, share)
+    return Scores(score, information, cross[:, None, :] * G.T, cov, share, busbar)
 
 
 def _share(modes: Modes, information: Floats, lost: Floats) -> Floats:
@@ -345,6 +386,12 @@ class Columns:
         """Squares of std, (q,)."""
         return np.asarray(self.std * self.std)
 
+    @cached_property
+    def without_powers(self) -> tuple[Floats, Floats, Floats]:
+        """W, squares and variance of the members and of the busbar."""
+        at = np.r_[: self.members, self.members + self.powers : self.std.size]
+        return self.W[:, at], self.squares[:, at], self.variance[at]
+
 
 def columns(modes: Modes, powers: Floats, power_std: Floats, std: float) -> Columns:
     """Columns of a set of members.
@@ -360,8 +407,7 @@ def columns(modes: Modes, powers: Floats, power_std: Floats, std: float) -> Colu
     std
         Prior standard deviation of faults of meters and of the busbar, squared pu.
     """
-    H = modes.model.phases(modes.at)
-    H = H[:, H.any(axis=0)]
+    H = modes.phases
     return Columns(
         W=np.hstack([modes.U.T, modes.U.T @ powers[modes.at], modes.U.T @ H]),
         std=np.concatenate([np.full(modes.size, std), power_std, np.full(H.shape[1], std)]),

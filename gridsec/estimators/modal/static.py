@@ -114,7 +114,7 @@ def follow(modes: Modes, before: Static, update: Update) -> Static:
             cov, turn = current(modes, now).cov, cov @ ((gamma * update.score) @ modes.directions)
         elif modes.busbar:
             G = modes.directions[:, : modes.busbar]
-            turn[: modes.busbar] = of_busbar(modes, before) @ ((gamma * update.score) @ G)
+            turn[: modes.busbar] = of_busbar(modes, now) @ ((gamma * update.score) @ G)
         moved, theta = modes.directions @ turn, before.theta + turn
         return Static(g, gamma, before.pull, information, theta, cov, update.score, moved)
     weighed = update.innovation / update.variance

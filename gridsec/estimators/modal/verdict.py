@@ -16,7 +16,7 @@ CLEAN: none of these.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from math import log
 
 import numpy as np
@@ -43,8 +43,6 @@ LIKELY = 0.01
 """Weight from which on an explanation is reported, 1."""
 SHOWN = 20
 """Largest number of reported explanations."""
-LEADING = 0.2
-"""Weight from which on an explanation with the busbar's meter has a rival without it, 1."""
 LEAST_PRECISION = 1e-6
 """Least precision of a reading, 1 / squared pu^2: below it nothing is known of a voltage."""
 LEAST_V2 = 1e-2
@@ -216,50 +214,6 @@ def explanations(
             )
         )
     return tuple(out)
-
-
-def with_complements(core: Core, suspicion: Suspicion, most: int) -> Suspicion:
-    """Explanations with a rival for each that accuses a phase of the busbar and some of its meters.
-
-    A phase of the busbar that is off by one amount, with some of its meters off by the opposite one, looks
-    like all other meters of the phase being off. Where those are at most `most`, both are equally likely.
-    Explanations below `LEADING` bring no rival.
-
-    Parameters
-    ----------
-    core, suspicion
-        The core, and the explanations.
-    most
-        Largest number of manipulated meters.
-    """
-    found, p = suspicion.found, core.modes.size
-    H = core.model.phases(core.modes.at) > 0.0
-    H, first = H[:, H.any(axis=0)], p + core.faults.powers
-    rows, models, weights = [], [], []
-    leading = found.weight >= LEADING
-    each = zip(found.chosen[leading], found.model[leading], found.weight[leading], strict=True)
-    for chosen, model, weight in each:
-        for phase in np.flatnonzero(chosen[first:]).tolist():
-            of_phase = H[:, phase]
-            others = of_phase & ~chosen[:p]
-            if any_of(chosen[:p] & of_phase) and np.count_nonzero(others | (chosen[:p] & ~of_phase)) <= most:
-                rival = chosen.copy()
-                rival[:p] = others | (chosen[:p] & ~of_phase)
-                rival[first + phase] = False
-                rows.append(rival)
-                models.append(model)
-                weights.append(weight)
-    if not rows:
-        return suspicion
-    weight = np.concatenate([found.weight, weights])
-    order, weight = np.argsort(-weight, kind="stable"), weight / weight.sum()
-    chosen = np.vstack([found.chosen, rows])[order]
-    named = weight[order] @ ~chosen[:, :p] < DOUBT
-    every = np.concatenate([found.model, models])[order]
-    return replace(
-        suspicion,
-        found=replace(found, chosen=chosen, model=every, weight=weight[order], named=np.asarray(named)),
-    )
 
 
 def accused(core: Core, suspicion: Suspicion) -> Bools:

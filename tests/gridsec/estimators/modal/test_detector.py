@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf, log, sqrt
 
 import numpy as np
@@ -191,7 +192,7 @@ def test_dropping_onsets_leaves_m_and_covers_all_ages() -> None:
     gone = detector._thin(test, capital, test.ratio)
     used = onsets.used & ~np.isin(np.arange(onsets.used.size), gone)
     now = signatures.scores(made, onsets, more)
-    ratio = detector.log_ratios(of, made, now, full=True)
+    ratio = detector.log_ratios(of, made, now, powers=True)
     by_row = capital + np.log(np.array(detector.WEIGHTS))[:, None] + ratio
     ripe = used & ~(onsets.ramp & (onsets.age < detector.RAMP_EVERY))
     assert np.isclose(np.logaddexp.reduce(by_row[:, ripe], axis=None), evidence.log_m, atol=1e-9)
@@ -258,6 +259,59 @@ def test_no_onset_no_evidence() -> None:
     made = modes(busbar())
     now = signatures.scores(made, signatures.empty(made, 2), static.start(made))
     of = signatures.columns(made, power_columns(FEEDER), np.full(24, 0.05), 0.01)
-    ratio = detector.log_ratios(of, made, now, full=False)
+    ratio = detector.log_ratios(of, made, now, powers=False)
     assert np.allclose(ratio[:2], 0.0)
-    assert (ratio[2] == -inf).all()
+    # The busbar alone is one of 25 columns of its kind.
+    assert np.allclose(ratio[2], -log(25.0))
+
+
+@pytest.mark.parametrize("make", [busbar, mixed])
+def test_the_information_about_the_busbar_is_exact(make: object) -> None:
+    """With missing readings and unknown directions it is the variance of the score, by dense matrices."""
+    assert callable(make)
+    model: ResidualModel = replace(make(), fixed_s=inf)
+    made, p, ticks = modes(model), 12, 8
+    random = np.random.default_rng(14)
+    seen = random.random((ticks, p)) >= 0.3
+    seen[:2] = True
+    unknown = 0.01 * random.random((ticks, p, 2)) + 0.01
+
+    def after(readings: Floats) -> tuple[float, float]:
+        state, more, onsets = modal.start(made, 0.0), static.start(made), signatures.empty(made, 1)
+        for k, m in enumerate(readings):
+            open_ = unknown[k] if k > 1 else None
+            state, more, update = full.step(made, state, more, float(k), m, seen[k], unknown=open_)
+            onsets = signatures.follow(made, onsets, update, more, 1.0, begun=[0] if k == 1 else [])
+        assert onsets.busbar is not None
+        return float(signatures.scores(made, onsets, more).score[0] @ made.U.T @ made.phases[:, 0]), float(
+            onsets.busbar[0, 0]
+        )
+
+    response = np.array([after(one)[0] for one in np.eye(ticks * p).reshape(-1, ticks, p)]).reshape(ticks, p)
+    at, apart = np.arange(p), np.abs(np.subtract.outer(np.arange(ticks), np.arange(ticks)))
+    rho = np.exp(-apart / model.time_s)
+    w = (1.0 - model.lasting) * model.loads(at)
+    variance = float(
+        np.sum(rho * (response @ w @ response.T)) + np.sum(response @ model.static(at) @ response.T)
+    )
+    for k in range(ticks):
+        A = unknown[k] if k > 1 else np.zeros((p, 0))
+        variance += float(response[k] @ (model.noise(at) + A @ A.T) @ response[k])
+    # Eigenvalues of the loads below 1e-9 of the largest one are zero in the modes.
+    assert np.isclose(after(np.zeros((ticks, p)))[1], variance, rtol=1e-6)
+
+
+def test_a_shift_of_all_meters_along_an_unknown_direction_is_found() -> None:
+    """An unread power at the head of a feeder moves all meters alike: 2 % is beyond it at once."""
+    made, limit = modes(busbar()), log(3.2e7)
+    of = signatures.columns(made, power_columns(FEEDER), np.full(24, 0.05), 0.01)
+    readings = Source(busbar(), np.random.default_rng(15)).ticks(40)
+    readings[30:] += 0.04
+    state, more, test = modal.start(made, 0.0), static.start(made), detector.start(made)
+    out = []
+    for k, m in enumerate(readings):
+        state, more, update = full.step(made, state, more, float(k), m, unknown=np.full((12, 1), 0.006))
+        test, evidence = detector.step(made, of, test, update, more, h=1.0, alert=limit / 2.0)
+        out.append(evidence.log_m)
+    assert max(out[:30]) < limit
+    assert max(out[30:33]) >= limit

@@ -6,14 +6,17 @@ import numpy as np
 
 from benchmarks._residuals import Dense, Source, power_columns, tree
 from gridsec.arrays import Floats
-from gridsec.estimators.modal import core, doubts, full, static
+from gridsec.estimators.modal import core, doubts, full, search, static
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.doubts import Unknown
 from gridsec.estimators.modal.model import modes
+from gridsec.estimators.modal.search import SearchProblem
+from gridsec.estimators.modal.signatures import Joint
 from tests.gridsec.estimators.modal.test_core import MODEL
 from tests.gridsec.estimators.modal.test_filter import proportional
 
-COLUMN = power_columns(tree(12, np.random.default_rng(3)))[:, [7]]
+STEPS = power_columns(tree(12, np.random.default_rng(3)))[:, :12]
+COLUMN = STEPS[:, [7]]
 """Effect of one customer's active power on the meters."""
 POWER = 0.03
 """An unread power, pu: 3 kW."""
@@ -85,3 +88,46 @@ def test_without_readings_nothing_is_known() -> None:
     mean, variance = doubts.estimated(modes(MODEL), given, np.ones(12), np.zeros(12, dtype=np.bool_))
     assert not mean.any()
     assert np.allclose(variance, 1.0)
+
+
+def test_the_search_integrates_lasting_errors_out() -> None:
+    """Costs less twice the gain are those with the lasting amounts as faults without a charge."""
+    random = np.random.default_rng(6)
+    kernel = core.assemble(MODEL, np.vstack([np.zeros(12), STEPS]), np.full(12, 0.1), gamma=1e6)
+    root, U = random.standard_normal((12, 12)), 0.02 * random.standard_normal((12, 2))
+    joint = Joint(random.standard_normal(12), root @ root.T, np.zeros((2, 12, 12)), 1.0)
+    reduced, gain = core._problem(kernel, joint, U)
+    W = np.hstack([kernel.faults.W, kernel.modes.U.T @ U])
+    y, F = joint.of(W)
+    plain, none = core._problem(kernel, joint, None)
+    assert none == 0.0
+    whole = SearchProblem(
+        y,
+        F,
+        np.concatenate([plain.std, np.full(2, core.LASTS)]),
+        12,
+        np.concatenate([plain.charge, np.zeros(2)]),
+        np.full(y.size, np.inf),
+    )
+    for chosen in random.random((5, plain.y.size)) < 0.2:
+        both = np.append(chosen, [True, True])
+        assert np.isclose(search.cost(reduced, chosen) - 2.0 * gain, search.cost(whole, both))
+
+
+def test_a_lasting_error_does_not_decide_between_meters_over_time() -> None:
+    """One of three meters beyond an unread power is off, or both others are: no evidence arises from time."""
+    group = np.arange(12) >= 9
+    unknown, kernel = (
+        np.where(group, 0.3, 0.0)[:, None],
+        core.assemble(MODEL, np.vstack([np.zeros(12), STEPS]), np.full(12, 0.1), gamma=1e6),
+    )
+    source, state, odds = Source(MODEL, np.random.default_rng(2)), core.init(kernel, 0.0), []
+    lie = 0.06 * (np.arange(12) == 9)
+    for k in range(340):
+        m = source.tick() + lie * (k >= 40) + 0.06 * group * (k >= 40)
+        state, _ = core.step(kernel, state, float(k), m, None, unknown)
+        if k in (60, 339):
+            problem, _ = core._problem(kernel, state.suspected[0].joint(kernel.modes), unknown)
+            sets = (np.arange(problem.y.size) == 9, np.isin(np.arange(problem.y.size), (10, 11)))
+            odds.append(search.cost(problem, sets[0]) - search.cost(problem, sets[1]))
+    assert abs(odds[1] - odds[0]) < 10.0

@@ -1,0 +1,174 @@
+"""Mirror images of explanations: the believed meters of a neighbourhood accused, not the accused ones.
+
+Let J be a set of faults and g a neighbourhood: meters of a lateral, or of a phase with the busbar's meter.
+Where the meters ``J & g`` are off by one amount x, the meters ``g - J`` differ from them by x, and only what
+lies outside of g tells which of both are right. Unread powers, unlearned classes and large loads hide that.
+No prior of meters may decide then: the mirror image has the penalty of J,
+
+    cost(J') = cost(J) + L(J') - min(L(J), L_one(J)),     L = -y' (F + 1 / s^2)^-1 y + log det(1 + s^2 F)
+
+with L(J') and L_one(J) of one amount for the exchanged meters. So readings alone decide between both.
+
+**Laterals.** ``J' = J xor g``, with and without the false powers of J, for every group of neighbours but the
+whole feeder. A majority of a lateral that agrees is believed only as far as others confirm it.
+
+**Phases.** A phase of the busbar off by x, with meters A of the phase off by -x, has the same residuals as
+the other meters of the phase off by -x: L is the same. The promise "at most M manipulated meters" excludes a
+whole phase of more than M meters, and the busbar's meter with more than M of its phase. From meters to the
+busbar's meter with others, J' has its own penalty, if that is larger: one meter that is off is no reason to
+doubt all others of its phase.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from gridsec.arrays import Bools, Ints, any_of
+from gridsec.estimators.modal.model import Modes
+from gridsec.estimators.modal.search import (
+    BELIEVED,
+    DOUBT,
+    Identification,
+    SearchProblem,
+    clusters,
+    penalty,
+)
+
+REFLECTED = 0.01
+"""Weight from which on an explanation has mirror images, 1: that of reported explanations."""
+APART = 20.0
+"""Cost of one amount in place of several from which on meters are not off alike, 1."""
+_TINY = float(np.finfo(np.float64).tiny)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Neighbourhoods:
+    """Neighbourhoods of p meters.
+
+    Attributes
+    ----------
+    laterals : (g, p)
+        Members of the groups of neighbours, without the whole feeder.
+    phases : (p, b)
+        Meters of each phase of the busbar.
+    most
+        Largest number of manipulated meters that is promised.
+    """
+
+    laterals: Bools = field(repr=False)
+    phases: Bools
+    most: int
+
+
+def neighbourhoods(modes: Modes, most: int) -> Neighbourhoods:
+    """Neighbourhoods of the members of some modes."""
+    some = [each for each in clusters(modes) if each.size < modes.size]
+    laterals = np.zeros((len(some), modes.size), dtype=np.bool_)
+    for k, each in enumerate(some):
+        laterals[k, each] = True
+    return Neighbourhoods(laterals, modes.phases > 0.0, most)
+
+
+def reflected(found: Identification, near: Neighbourhoods) -> Identification:
+    """Explanations with the mirror images of those that weigh at least `REFLECTED`."""
+    p = near.phases.shape[0]
+    cost = {
+        (model, chosen.tobytes()): -2.0 * np.log(weight)
+        for model, chosen, weight in zip(found.model.tolist(), found.chosen, found.weight, strict=True)
+    }
+    for k in np.flatnonzero(found.weight >= REFLECTED).tolist():
+        model = int(found.model[k])
+        own = cost[model, found.chosen[k].tobytes()]
+        for image, more in _images(found.problems[model], found.chosen[k], near):
+            key = model, image.tobytes()
+            cost[key] = min(own + more, cost.get(key, np.inf))
+    if len(cost) == len(found.weight):
+        return found
+    ordered = sorted((value, *key) for key, value in cost.items())
+    value = np.array([one for one, _, _ in ordered])
+    weight = np.exp(-0.5 * (value - value[0]))
+    weight /= weight.sum()
+    kept = weight >= BELIEVED
+    chosen = np.stack([np.frombuffer(key, dtype=np.bool_) for _, _, key in ordered])[kept]
+    weight = weight[kept] / weight[kept].sum()
+    return replace(
+        found,
+        chosen=chosen,
+        model=np.array([model for _, model, _ in ordered])[kept],
+        weight=weight,
+        named=np.asarray(weight @ ~chosen[:, :p] < DOUBT),
+    )
+
+
+def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iterator[tuple[Bools, float]]:
+    """Mirror images of a set, (q,), and their costs beyond its own."""
+    p, b = near.phases.shape
+    read = problem.F.diagonal()[:p] > _TINY
+    independent = _likelihood(problem, np.flatnonzero(chosen), None)
+    for phase in range(b):
+        image, column = _of_phase(chosen, near, phase, read)
+        if image is not None:
+            more = 0.0 if chosen[phase - b] else penalty(problem, image) - penalty(problem, chosen)
+            yield image, max(more, 0.0) + _apart(problem, chosen & image, column, independent)
+    done = set[bytes]()
+    for lateral in near.laterals & read:
+        accused, others = lateral & chosen[:p], lateral & ~chosen[:p]
+        key = others.tobytes() + accused.tobytes()
+        if key in done or not any_of(accused) or not any_of(others):
+            continue
+        done.add(key)
+        rest = chosen.copy()
+        rest[:p] &= ~lateral
+        own = _likelihood(problem, np.flatnonzero(rest), accused)
+        if own - independent > APART:
+            continue
+        for powers in (True, False) if any_of(rest[p:-b]) else (True,):
+            dropped = 0.0
+            if not powers:
+                dropped, rest = float(problem.charge[p:-b] @ rest[p:-b]), rest.copy()
+                rest[p:-b] = False
+            image = rest.copy()
+            image[:p] |= others
+            like = _likelihood(problem, np.flatnonzero(rest), others)
+            yield image, like - min(independent, own) - dropped
+
+
+def _of_phase(chosen: Bools, near: Neighbourhoods, phase: int, read: Bools) -> tuple[Bools | None, Bools]:
+    """Mirror image by one phase of the busbar, None for none, and the meters that are off in both, (p,)."""
+    p, b = near.phases.shape
+    of_phase, at = near.phases[:, phase] & read, chosen.size - b + phase
+    accused, others = chosen[:p] & of_phase, of_phase & ~chosen[:p]
+    image = chosen.copy()
+    image[:p] = (chosen[:p] & ~of_phase) | others
+    image[at] = not chosen[at]
+    count = int(np.count_nonzero(image[:p]))
+    if chosen[at]:
+        # All other meters of the phase; all of them only as far as that is promised.
+        return (image if any_of(others) and (any_of(accused) or count <= near.most) else None), others
+    return (image if any_of(accused) and count <= near.most else None), accused
+
+
+def _apart(problem: SearchProblem, rest: Bools, column: Bools, independent: float) -> float:
+    """Cost of one amount in place of independent ones, at least 0; infinite for `APART`."""
+    more = _likelihood(problem, np.flatnonzero(rest), column) - independent
+    return max(more, 0.0) if more <= APART else np.inf
+
+
+def _likelihood(problem: SearchProblem, at: Ints, alike: Bools | None) -> float:
+    """L of faults `at` with independent amounts, and of meters `alike` (p,) with one amount."""
+    y, F, std = problem.y[at], problem.F[np.ix_(at, at)], problem.std[at]
+    if alike is not None:
+        together = np.flatnonzero(alike)
+        side = problem.F[together].sum(axis=0)
+        F = np.block([[F, side[at][:, None]], [side[at][None, :], np.array([[side[together].sum()]])]])
+        y = np.append(y, problem.y[together].sum())
+        std = np.append(std, problem.std[0])
+    if not y.size:
+        return 0.0
+    pull = std * y
+    factor, low = cho_factor(np.eye(y.size) + std[:, None] * F * std)
+    return float(2.0 * np.log(factor.diagonal()).sum() - pull @ cho_solve((factor, low), pull))

@@ -1,0 +1,105 @@
+"""Mirror images of explanations: no meter is named where readings cannot tell it from its neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks._residuals import Source, model_of, power_columns, tree
+from gridsec.arrays import Bools, Floats
+from gridsec.estimators.modal import core, mirrors
+from gridsec.estimators.modal.core import Core
+from gridsec.estimators.modal.search import Identification
+from tests.gridsec.estimators.modal.test_search import problem
+
+FEEDER = tree(12, np.random.default_rng(3))
+MODEL = model_of(FEEDER)
+POWERS = np.vstack([np.zeros((1, 12)), power_columns(FEEDER)[:, :12]])
+
+
+def kernel(attacked: int = 4) -> Core:
+    """Core of a feeder of 12 meters."""
+    return core.assemble(MODEL, POWERS, np.full(12, 0.1), gamma=1e6, attacked=attacked)
+
+
+def lateral(of: Core) -> Bools:
+    """The largest group of neighbours but the whole feeder."""
+    sizes = of.near.laterals.sum(axis=1)
+    return np.asarray(of.near.laterals[int(sizes.argmax())])
+
+
+def looked(of: Core, lie: Floats, unknown: Floats | None = None) -> Identification:
+    """Explanations eight ticks after the onset of a lie of some meters, (p,)."""
+    source, state = Source(MODEL, np.random.default_rng(1)), core.init(of, 0.0)
+    for k in range(40):
+        state, evidence = core.step(of, state, float(k), source.tick() + lie * (k >= 32), None, unknown)
+    assert core.alarmed(of, evidence)
+    return core.identify(of, state, evidence).found
+
+
+def test_likelihoods_of_one_amount_are_exact() -> None:
+    """Against the covariance of all amounts by a dense determinant."""
+    given = problem(3, p=8, others=2)
+    rest, alike = np.array([1, 8]), np.isin(np.arange(8), (2, 4, 5))
+    at = np.array([1, 8, 2, 4, 5])
+    V = np.diag(given.std[at] ** 2)
+    V[2:, 2:] = given.std[2] ** 2
+    F, y = given.F[np.ix_(at, at)], given.y[at]
+    want = np.linalg.slogdet(np.eye(5) + V @ F)[1] - y @ np.linalg.solve(np.eye(5) + V @ F, V @ y)
+    assert np.isclose(mirrors._likelihood(given, rest, alike), want)
+    assert mirrors._likelihood(given, np.zeros(0, dtype=np.intp), None) == 0.0
+
+
+def test_a_majority_of_a_lateral_is_ambiguous_where_nothing_else_confirms_it() -> None:
+    """All but one meter of a lateral read 1 % too much; its level is unknown: no meter is named."""
+    of = kernel()
+    group = lateral(of)
+    honest = int(np.flatnonzero(group)[0])
+    lie = 0.02 * (group & (np.arange(12) != honest))
+    found = looked(of, lie, np.where(group, 0.3, 0.0)[:, None])
+    assert not found.named.any()
+    likely = found.chosen[found.weight > 0.1, :12]
+    assert any((each == (lie > 0.0)).all() for each in likely)
+    assert any((each == (np.arange(12) == honest)).all() for each in likely)
+
+
+def test_a_meter_is_named_where_its_lateral_is_confirmed() -> None:
+    """The same feeder with known powers: the meter that is off by 1 % is named, and no other."""
+    of = kernel()
+    one = int(np.flatnonzero(lateral(of))[0])
+    found = looked(of, 0.02 * (np.arange(12) == one))
+    assert (found.named == (np.arange(12) == one)).all()
+
+
+@pytest.mark.parametrize(("attacked", "named"), [(4, True), (12, False)])
+def test_the_busbar_is_certain_only_where_not_all_meters_may_be_manipulated(
+    attacked: int, named: bool
+) -> None:
+    of = kernel(attacked)
+    found = looked(of, np.full(12, 0.04))
+    without = float(found.weight @ ~found.chosen[:, -1])
+    assert (without < 1e-3) == named
+    if not named:
+        assert any(each.all() for each in found.chosen[found.weight > 0.1, :12])
+
+
+def test_the_busbar_and_some_meters_have_the_others_as_a_mirror_image() -> None:
+    """The busbar's meter and two meters off by one amount, or the other ten meters: as likely, any count."""
+    of = kernel()
+    lie = np.where(np.arange(12) < 2, 0.0, 0.04)
+    found = looked(of, lie)
+    assert not found.named.any()
+    for meters in (lie > 0.0, lie == 0.0):
+        assert found.weight @ (found.chosen[:, :12] == meters).all(axis=1) > 0.2
+
+
+def test_explanations_without_mirror_images_stay() -> None:
+    """A single false power has none."""
+    of = kernel()
+    given = looked(of, 0.02 * (np.arange(12) == 3))
+    chosen = np.zeros((1, given.chosen.shape[1]), dtype=np.bool_)
+    chosen[0, 14] = True
+    alone = replace(given, chosen=chosen, model=np.zeros(1, dtype=np.intp), weight=np.ones(1))
+    assert mirrors.reflected(alone, of.near) is alone
