@@ -101,8 +101,8 @@ def zenoh_config(
         bool,
         typer.Option(
             "--report-forgeries",
-            help="Pass all readings on the keys of meters that sign: `serve --meter-keys` refuses forged ones "
-            "with an incident, the router without one.",
+            help="Pass all readings on the keys of meters that sign; `serve --meter-keys` refuses forged "
+            "ones with an incident, the router without one.",
         ),
     ] = False,
 ) -> None:
