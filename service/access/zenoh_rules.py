@@ -1,8 +1,8 @@
 """zenoh configurations with mutual TLS, and access rules by the common name of a certificate.
 
-The router refuses by default. One rule per certificate lets it publish the keys of its own meters. The
-service alone publishes estimates, alarms and incidents. Every certificate may subscribe to these and query
-them.
+The router refuses by default, and silently. One rule per certificate lets it publish the keys of its own
+meters. The service alone publishes estimates, alarms and incidents. Every certificate may subscribe to these
+and query them.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ class Plan:
     """Certificates, feeders with their meters, assignments, endpoints of the router, prefix of all keys.
 
     `installed` is the folder of the certificates on the machines that use them. `keys` are rows of meters
-    that sign: feeder, meter, scheme, key.
+    that sign: feeder, meter, scheme, key. With `report_forgeries` every concentrator and meter may publish on
+    the keys of these: the router refuses silently, the service refuses a wrong signature with an incident.
     """
 
     certificates: tuple[Issued, ...]
@@ -51,6 +52,7 @@ class Plan:
     prefix: str
     installed: Path
     keys: tuple[tuple[str, ...], ...] = ()
+    report_forgeries: bool = False
 
 
 def read_assignments(path: Path | None) -> tuple[Assignment, ...]:
@@ -138,6 +140,9 @@ def _owners(plan: Plan) -> dict[tuple[str, str], str]:
     idle = {name for name, kind in kinds.items() if kind in (Kind.CONCENTRATOR, Kind.METER)}
     idle -= {one.certificate for one in given}
     problems += [Problem("missing", f"certificate {name} has no meter") for name in sorted(idle)]
+    if plan.report_forgeries and not plan.keys:
+        text = f"forgeries are reported of meters that sign; {KEYS_FILE} has none"
+        problems.append(Problem("missing", text))
     if problems:
         raise InputInvalid(problems)
     return owners
@@ -220,6 +225,12 @@ def access_control(plan: Plan, owners: Mapping[tuple[str, str], str]) -> dict[st
             "subjects": ["subject every service"],
         },
     ]
+    if plan.report_forgeries:
+        signed = sorted(_reading_key(plan.prefix, feeder, meter) for feeder, meter, *_ in plan.keys)
+        publishers = [name for name, kind in kinds.items() if kind in (Kind.CONCENTRATOR, Kind.METER)]
+        rules.append(_rule("publish signed", "ingress", ["put"], signed))
+        subjects.append({"id": "subject every publisher", "cert_common_names": publishers})
+        policies.append({"rules": ["publish signed"], "subjects": ["subject every publisher"]})
     for name, keys in published.items():
         rules.append(_rule(f"publish {name}", "ingress", ["put"], keys))
         subjects.append({"id": f"subject {name}", "cert_common_names": [name]})

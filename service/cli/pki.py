@@ -97,6 +97,14 @@ def zenoh_config(
         Path | None,
         typer.Option(help="Folder of the certificates on the machines that use them. [default: DIR]"),
     ] = None,
+    report_forgeries: Annotated[
+        bool,
+        typer.Option(
+            "--report-forgeries",
+            help="Pass all readings on the keys of meters that sign; `serve --meter-keys` refuses forged "
+            "ones with an incident, the router without one.",
+        ),
+    ] = False,
 ) -> None:
     """Write zenoh configurations with mutual TLS, and access rules by certificate.
 
@@ -116,6 +124,7 @@ def zenoh_config(
             prefix=prefix,
             installed=(installed or folder).absolute(),
             keys=zenoh_rules.kept_keys(out),
+            report_forgeries=report_forgeries,
         )
         files = zenoh_rules.files(plan)
     out.mkdir(parents=True, exist_ok=True)

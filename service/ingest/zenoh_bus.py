@@ -95,11 +95,12 @@ def _first_line(error: BaseException) -> str:
 
 @contextmanager
 def session(config: BusConfig) -> Iterator[zenoh.Session]:
-    """Open a zenoh session and close it in any case.
+    """Open a zenoh session and close it in any case; `RUST_LOG` writes zenoh's own log to standard output.
 
     Raises BusUnavailable if an endpoint cannot be listened on or connected to, or the configuration is wrong.
     """
     built = _config(config)
+    zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
     try:
         opened = zenoh.open(built)
     except zenoh.ZError as error:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -15,7 +19,10 @@ import zenoh
 from gridsec.errors import InputInvalid
 from service.access import pki, zenoh_rules
 from service.access.pki import Kind
+from service.access.signing import read_meter_keys
+from service.ingest.decode import Wire
 from service.ingest.queues import BusConfig, BusUnavailable, Sample
+from service.ingest.reading import BadReason, Known
 from service.ingest.zenoh_bus import Bus, MeterClient, session
 from tests.codes import refused
 from tests.service.running import free_port, until
@@ -226,6 +233,64 @@ def test_the_service_itself_can_be_the_router(tmp_path: Path) -> None:
 
         until(both)
     assert {sample.payload for sample in samples} == {b"own"}
+
+
+def test_a_refusal_of_the_router_is_a_line_of_its_log_only(tmp_path: Path) -> None:
+    """The line states certificate and key. Sender and service learn nothing."""
+    write(planned(tmp_path, f"tls/127.0.0.1:{free_port()}"))
+    code = (
+        "import sys; from pathlib import Path; from service.ingest.queues import BusConfig\n"
+        "from service.ingest.zenoh_bus import session\n"
+        "with session(BusConfig(None, file=Path(sys.argv[1]))): print('open', flush=True); sys.stdin.read()"
+    )
+    target = "zenoh::net::routing::interceptor::access_control=trace"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, tmp_path / "router.json5"],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=os.environ | {"RUST_LOG": target},
+    ) as router:  # fmt: skip
+        assert router.stdout is not None
+        lines = iter(router.stdout.readline, "")
+        assert any("open" in line for line in lines)
+        with session(BusConfig(None, file=tmp_path / "c2.json5")) as c2:
+            key = "gridsec/town/meter/m01/reading"
+            c2.put(key, b"forged")
+            found = next(line for line in lines if "is unauthorized to Put (ingress)" in line)
+        assert "CertCommonName(c2)" in found
+        assert found.rstrip().endswith(key)
+        router.communicate()
+
+
+def test_forged_readings_of_meters_that_sign_reach_the_service(tmp_path: Path) -> None:
+    """The service refuses them by their signature; those of other meters stay refused silently."""
+    plan = planned(tmp_path, f"tls/127.0.0.1:{free_port()}")
+    secret = base64.b64encode(b"secret of 16 bytes").decode()
+    write(replace(plan, keys=(("town", "m02", "hmac", secret),), report_forgeries=True))
+    samples: list[Sample] = []
+    config = BusConfig(None, file=tmp_path / "router.json5")
+    with (
+        Bus(config, "gridsec", samples.extend, max_payload=1000, lossless=True),
+        session(BusConfig(None, file=tmp_path / "c1.json5")) as c1,
+    ):
+
+        def forge() -> bool:
+            for place in ("town/meter/m02", "town/meter/m05", "village/meter/m01"):
+                c1.put(f"gridsec/{place}/reading", b'{"t": 1795212000, "v_volt": 250}')
+            c1.put("gridsec/town/estimate", b"forged")
+            c1.delete("gridsec/town/meter/m02/reading")
+            return bool(samples)
+
+        until(forge)
+        time.sleep(0.2)
+    assert {sample.key for sample in samples} == {"gridsec/town/meter/m02/reading"}
+    keys = read_meter_keys(tmp_path / "meter-keys.csv", accepts_unlisted=False)
+    known = {name: Known(sorted(meters), 230.0, 100.0) for name, meters in FEEDERS.items()}
+    gathered = Wire(known, keys=keys).gather(samples)
+    assert {(bad.reason, bad.feeder, bad.meter) for bad, _ in gathered.bad} == {
+        (BadReason.SIGNATURE, "town", "m02")
+    }
+    assert gathered.readings == {}
+    with refused(InputInvalid, "missing"):
+        zenoh_rules.files(replace(plan, report_forgeries=True))
 
 
 def test_the_router_has_a_rule_for_each_certificate(tmp_path: Path) -> None:
