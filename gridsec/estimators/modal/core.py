@@ -428,11 +428,12 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     rows = [] if state.suspected else [int(evidence.rows[0])]
     rows = list(dict.fromkeys(rows + np.flatnonzero(test.pinned & test.onsets.used).tolist()))
     found = _searched(core, state, rows[0])
-    best = 0
-    if len(rows) > 1:
-        std, chosen = found.problems[0].std, found.chosen[0]
-        each = [_problem(core, _joint(core, _parts(state), row), chosen) for row in rows]
-        best = int(np.argmin([cost(replace(one, std=std), chosen) for one in each]))
+    std = found.problems[0].std
+    costs = [
+        cost(replace(_problem(core, _joint(core, _parts(state), row)), std=std), found.chosen[0])
+        for row in rows
+    ]
+    best = int(np.argmin(costs))
     if best:
         found = _searched(core, state, rows[best])
     return Suspicion(rows[best], found)
@@ -463,14 +464,10 @@ def _searched(core: Core, state: CoreState, row: int) -> Identification:
     return search(model, core.groups, list(zip(problems, costs, strict=True)))
 
 
-def _problem(core: Core, joint: Joint, only: Bools | None = None) -> SearchProblem:
-    """Scores, information and charges of all faults at one onset; zero beside the faults `only` (q,)."""
+def _problem(core: Core, joint: Joint) -> SearchProblem:
+    """Scores, information and charges of all faults at one onset."""
     faults, p = core.faults, core.modes.size
-    if only is None:
-        y, F = joint.of(faults.W)
-    else:
-        y, F = np.zeros(only.size), np.zeros((only.size, only.size))
-        y[only], F[np.ix_(only, only)] = joint.of(faults.W[:, only])
+    y, F = joint.of(faults.W)
     accusation = 2.0 * log(p)
     charge = np.zeros(y.size)
     charge[p:] = accusation
