@@ -415,9 +415,10 @@ class Suspicion:
 def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     """Sets of faults that explain the readings, since the onset that suits them best.
 
-    The search is made at the likeliest onset, under the model of the loads and its rivals. The costs of what
-    it finds are then compared at the pinned onsets, and where another one is cheaper, the search is made
-    there. Where readings are missing, only the pinned onsets are searched, with exact scores.
+    The search is made at the onset that suits faults of all members best, under the model of the loads and
+    its rivals. The costs of what it finds are then compared at the other onsets, and where another one is
+    cheaper, the search is made there. Where readings are missing, only the pinned onsets are searched, with
+    exact scores.
 
     Parameters
     ----------
@@ -427,6 +428,7 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     test = state.detector
     rows = [] if state.suspected else [int(evidence.rows[0])]
     rows = list(dict.fromkeys(rows + np.flatnonzero(test.pinned & test.onsets.used).tolist()))
+    rows = sorted(rows, key=lambda row: _misfit(core, _joint(core, _parts(state), row)))
     found = _searched(core, state, rows[0])
     std = found.problems[0].std
     costs = [
@@ -437,6 +439,16 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     if best:
         found = _searched(core, state, rows[best])
     return Suspicion(rows[best], found)
+
+
+def _misfit(core: Core, joint: Joint) -> float:
+    """Cost of faults of all members at one onset, without the penalty; O(t^3).
+
+    The amounts have the prior of `detector.omnibus`. The likeliest onset then seldom changes after a search.
+    """
+    s2, y = SIZE**2 / core.modes.white, joint.score
+    A = joint.information + np.eye(y.size) / s2
+    return float(np.linalg.slogdet(A)[1] - y @ np.linalg.solve(A, y))
 
 
 def _parts(state: CoreState) -> Parts:
