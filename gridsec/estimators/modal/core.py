@@ -70,9 +70,10 @@ class Core:
     modes
         Modes of all meters.
     effect : (n, q)
-        Change of the model at every place by each fault: meters (none), false active powers, busbar.
+        Change of the model at every place by each fault: meters (none), powers and inverters, busbar.
     faults
-        Columns of all faults. False reactive powers are left out: they move voltages nearly as active ones.
+        Columns of all faults; injections of inverters beyond their curves count among the powers, after those
+        of the customers. False reactive powers are left out: they move voltages nearly as active ones.
     groups, near
         Groups of neighbours, for the search, and neighbourhoods, for mirror images of explanations.
     estimator
@@ -128,7 +129,13 @@ class CoreState:
 
 
 def assemble(
-    model: ResidualModel, powers: Floats, most: Floats, *, gamma: float, attacked: int | None = None
+    model: ResidualModel,
+    powers: Floats,
+    most: Floats,
+    *,
+    gamma: float,
+    attacked: int | None = None,
+    inverters: tuple[Floats, Floats] | None = None,
 ) -> Core:
     """Prepare a core.
 
@@ -144,6 +151,8 @@ def assemble(
         Least average number of ticks from one false alarm to the next, at least 1.
     attacked
         Largest number of manipulated meters that is promised; None: a third.
+    inverters : (n, m), (m,)
+        Effect of their injections on all places, squared pu per pu, and their ranges, pu; None: none.
 
     Raises
     ------
@@ -153,6 +162,10 @@ def assemble(
     if not 1.0 <= gamma < inf:
         raise InputInvalid([Problem("out-of-range", f"gamma is {gamma}; it must be at least 1 and finite")])
     made, at = modes(model), model.meters
+    most = MOST_POWER * most
+    if inverters is not None:
+        # An inverter that leaves its curve stays within its range.
+        powers, most = np.hstack([powers, inverters[0]]), np.concatenate([most, inverters[1]])
     std = np.full(powers.shape[1], FALSE_POWER)
     used = model.phases(made.at).any(axis=0)
     return Core(
@@ -163,7 +176,7 @@ def assemble(
         groups=groups(made),
         near=mirrors.neighbourhoods(made, max(1, at.size // 3) if attacked is None else attacked),
         estimator=estimates.estimator(made),
-        bound=np.concatenate([np.full(at.size, inf), MOST_POWER * most, np.full(int(used.sum()), inf)]),
+        bound=np.concatenate([np.full(at.size, inf), most, np.full(int(used.sum()), inf)]),
         limit=log(gamma),
         rivals=rivals.rivals(made),
     )
@@ -183,7 +196,16 @@ def design(front: SequentialDesign, most: Floats | None = None) -> Core:
     most = np.full(every.size, CONNECTION) if most is None else most
     powers = front.sensitivities.columns(Power.ACTIVE, every)
     gamma = max(1.0, YEAR_S / (front.step_s * front.options.alarms_per_year))
-    return assemble(residual_model(front), powers, most, gamma=gamma, attacked=front.max_attacked)
+    droop = front.plant.droop
+    inverters = front.sensitivities.columns(Power.REACTIVE, droop.customer), np.asarray(droop.span)
+    return assemble(
+        residual_model(front),
+        powers,
+        most,
+        gamma=gamma,
+        attacked=front.max_attacked,
+        inverters=inverters if droop.customer.size else None,
+    )
 
 
 def residuals(state: SequentialState) -> tuple[Floats, Bools]:

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -46,7 +47,13 @@ from gridsec.estimators.sequential.attack_kind import (
     repeat_lags,
 )
 from gridsec.estimators.sequential.design import SequentialDesign, SequentialOptions
-from gridsec.estimators.sequential.device_checks import BusbarTrust, track_busbar
+from gridsec.estimators.sequential.device_checks import (
+    BusbarTrust,
+    InverterChecks,
+    ReportedPowers,
+    check_inverters,
+    track_busbar,
+)
 from gridsec.estimators.sequential.measurements import (
     FrameUncertainty,
     Measurements,
@@ -166,6 +173,8 @@ class ModalState:
         Searches in turn that name each meter.
     phases : (b,)
         Searches in turn that name each phase of the busbar with a meter.
+    inverters : (m,)
+        Searches in turn that name each inverter.
     due
         Number of the tick of the next search.
     kept
@@ -177,6 +186,7 @@ class ModalState:
     suspicion: Suspicion | None
     streak: Ints
     phases: Ints
+    inverters: Ints
     due: int
     kept: Record | None
 
@@ -207,7 +217,8 @@ def init(design: ModalDesign, t: float, commission: Commission | None = None) ->
     begun = _begun(kernel, before, t)
     p = kernel.modes.size
     counts = np.zeros(phases.std.size - p - phases.powers, dtype=np.intp)
-    return ModalState(front, begun, None, np.zeros(p, dtype=np.intp), counts, 0, before)
+    none, inverters = np.zeros(p, dtype=np.intp), np.zeros(design.plant.droop.tau.size, dtype=np.intp)
+    return ModalState(front, begun, None, none, counts, inverters, 0, before)
 
 
 def _begun(kernel: Core, before: Record | None, t: float) -> CoreState:
@@ -265,7 +276,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
         None if all_of(seen) else seen,
         None if open_ is None else open_.wide,
     )
-    after, evidence = _identified(design, replace(state, front=now, core=kernel), evidence)
+    after, evidence = _identified(design, replace(state, front=now, core=kernel), evidence, measured.uses_q)
     if not np.array_equal(after.front.busbar.trusted, now.busbar.trusted):
         # A phase named at this tick is not metered any more.
         metered = np.asarray(measured.busbar_metered) & after.front.busbar.trusted
@@ -338,14 +349,17 @@ def _repeating(state: CoreState, which: Bools) -> CoreState:
 # --- Identification ---
 
 
-def _identified(design: ModalDesign, state: ModalState, evidence: Evidence) -> tuple[ModalState, Evidence]:
+def _identified(
+    design: ModalDesign, state: ModalState, evidence: Evidence, uses_q: Bools
+) -> tuple[ModalState, Evidence]:
     """State after a search, if one is due, with the confirmed meters masked."""
     kernel, tick = design.core, state.front.ticks
     suspicion, pinned = state.suspicion, state.core.detector.pinned
     if suspicion is not None and not pinned[suspicion.row]:
         suspicion = None
     if not any_of(pinned):
-        none = replace(state, suspicion=None, streak=0 * state.streak, phases=0 * state.phases, due=0)
+        zero = 0 * state.streak, 0 * state.phases, 0 * state.inverters
+        none = replace(state, suspicion=None, streak=zero[0], phases=zero[1], inverters=zero[2], due=0)
         return none, evidence
     if tick < state.due or not core.alarmed(kernel, evidence):
         return replace(state, suspicion=suspicion), evidence
@@ -353,10 +367,14 @@ def _identified(design: ModalDesign, state: ModalState, evidence: Evidence) -> t
     named = suspicion.found.named & ~state.core.masked.meters
     streak = np.where(named, state.streak + 1, 0)
     phases = np.where(verdict.certain_phases(kernel, suspicion), state.phases + 1, 0)
+    certain = verdict.certain_inverters(design.front, kernel, suspicion, uses_q)
+    inverters = np.where(certain, state.inverters + 1, 0)
     age = int(state.core.detector.onsets.age[suspicion.row])
-    # A meter that was named once is searched again at the next tick.
-    wait = 1 if (streak == 1).any() or (phases == 1).any() else max(1, age // LOOKS)
-    after = replace(state, suspicion=suspicion, streak=streak, phases=phases, due=tick + wait)
+    # What was named once is searched again at the next tick.
+    wait = 1 if any((each == 1).any() for each in (streak, phases, inverters)) else max(1, age // LOOKS)
+    after = replace(
+        state, suspicion=suspicion, streak=streak, phases=phases, inverters=inverters, due=tick + wait
+    )
     confirmed = streak >= CONFIRM
     if any_of(confirmed):
         found = replace(suspicion.found, named=confirmed)
@@ -431,7 +449,9 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
     evidence = verdict.meter_evidence(
         design.core, kernel, tick.evidence, (tick.m, seen), front.options.widest, state.suspicion
     )
-    rivals = verdict.explanations(front, design.core, state.suspicion)
+    rivals = verdict.explanations(front, design.core, state.suspicion, tick.measured.uses_q)
+    checks = _checked_inverters(design, state, trust, tick)
+    inverters = ((state.inverters >= CONFIRM) & ~checks.consistent(front)) | checks.named(front)
     given = verdict.Inputs(
         frame=tick.measured.frame,
         seen=seen,
@@ -442,22 +462,25 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         explanations=rivals,
         suspicion=state.suspicion,
         settled=_settled(front, tick.predicted),
+        inverters=inverters,
         busbar=busbar.named,
         metered=np.atleast_1d(np.asarray(tick.measured.busbar_metered)),
         busbar_off=np.where(busbar.named, busbar.off, 0.0),
     )
     kinds = _kinds(design, state, tick, estimate, named)
+    finding = verdict.verdict(front, given, estimate)
+    open_cases = checks.explanations(front, named)
     answer = Verdict(
-        *verdict.verdict(front, given, estimate),
+        *verdict.with_open_cases(front, finding, open_cases),
         named,
         evidence.score,
         evidence.threshold,
         _attack(design, state, tick, estimate, named),
-        inverters=np.zeros(front.plant.droop.tau.size, dtype=np.bool_),
-        inverter_attack=np.zeros(front.plant.droop.tau.size),
+        inverters=inverters,
+        inverter_attack=_injected(design, state, checks, inverters),
         kinds=kinds.kinds,
-        explanations=rivals if suspected and len(rivals) > 1 else (),
-        unjudged=np.ones(front.plant.droop.tau.size, dtype=np.bool_),
+        explanations=rivals if suspected and len(rivals) > 1 else open_cases,
+        unjudged=front.inverter_undetectable & ~(checks.observable | inverters),
         busbar=given.busbar,
         busbar_attack=given.busbar_off,
     )
@@ -475,6 +498,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         x=tick.predicted.x,
         model_driven=tick.predicted.model_driven,
         injection_error=_injection_error(front, now, tick, trust.trust.trusted),
+        inverter_checks=checks,
         attack_kinds=kinds,
         busbar=busbar,
         learning=learning,
@@ -619,6 +643,38 @@ def _attack(design: ModalDesign, state: ModalState, tick: _Tick, estimate: Estim
     return np.where(named & tick.measured.available, off, 0.0)
 
 
+def _checked_inverters(
+    design: ModalDesign, state: ModalState, now: SequentialState, tick: _Tick
+) -> InverterChecks:
+    """Comparison of metered reactive powers with the droop curves."""
+    before, measured, front = now.inverter_checks, tick.measured, design.front
+    if before.idle and not any_of(measured.reports_q):
+        return before
+    residual, std = verdict.deviations(design.core, state.core, tick.m)
+    return check_inverters(
+        front,
+        before,
+        ReportedPowers(
+            measured.frame,
+            measured.reports_q,
+            measured.uses_q,
+            measured.available & now.trust.trusted,
+            tick.predicted.x,
+            tick.predicted.injection_error.error,
+            residual,
+            std,
+            partial(verdict.share, front, design.core, state.core),
+        ),
+    )
+
+
+def _injected(design: ModalDesign, state: ModalState, checks: InverterChecks, inverters: Bools) -> Floats:
+    """Injections of named inverters beyond their curves, as metered where they are, (m,), pu."""
+    metered = checks.amounts(design.front)
+    found = verdict.inverter_amounts(design.front, design.core, state.suspicion)
+    return np.where(inverters, np.where(metered != 0.0, metered, found), 0.0)
+
+
 def _kinds(
     design: ModalDesign, state: ModalState, tick: _Tick, estimate: Estimate, named: Bools
 ) -> AttackKinds:
@@ -727,11 +783,12 @@ def renew(design: ModalDesign, state: ModalState, which: Bools) -> ModalState:
         state.front,
         learned=known.learned,
         learning=known.learning,
+        inverter_checks=state.front.inverter_checks.without_meters(which),
         attack_kinds=replace(kinds, history=forget_readings(kinds.history, which)),
         trust=state.front.trust.replaced(which),
     )
-    zero = 0 * state.streak
-    return ModalState(now, begun, None, zero, 0 * state.phases, 0, record.made(modes, opened, kernel.static))
+    zero = 0 * state.streak, 0 * state.phases, 0 * state.inverters
+    return ModalState(now, begun, None, *zero, 0, record.made(modes, opened, kernel.static))
 
 
 def progress(design: ModalDesign, commission: Commission) -> LearningProgress:

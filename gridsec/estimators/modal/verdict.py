@@ -9,17 +9,18 @@ y and F being its score and its information. The score shown is the amount ``|y|
 amount at equality. The sum may reach the limit before any of its parts does. For a masked meter the score is
 the distance of its reading from the filter without it, the threshold that of the release.
 
-**Decision.** ATTACKED: a meter is named, or the busbar's. UNDECIDED: log M was beyond the limit since the
-suspected onset, and no meter is named; too few meters; unread powers that leave a voltage too uncertain.
-CLEAN: none of these.
+**Decision.** ATTACKED: a meter is named, an inverter, or the busbar's meter. UNDECIDED: log M was beyond the
+limit since the suspected onset, and nothing is named; a metered reactive power leaves its curve; too few
+meters; unread powers that leave a voltage too uncertain. CLEAN: none of these.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import log
 
 import numpy as np
+from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, all_of, any_of, indices
 from gridsec.estimators.detection import DecisionInputs, decide
@@ -29,6 +30,7 @@ from gridsec.estimators.modal.detector import SIZE, WEIGHTS, Evidence
 from gridsec.estimators.modal.search import DOUBT, amounts
 from gridsec.estimators.plant import NO_VOLTAGE
 from gridsec.estimators.sequential.design import SequentialDesign
+from gridsec.estimators.sequential.device_checks import probability
 from gridsec.estimators.sequential.measurements import largest_offset, unusable_offsets
 from gridsec.estimators.sequential.output import (
     busbar_deviation,
@@ -178,7 +180,7 @@ def _row(state: CoreState, evidence: Evidence, suspicion: Suspicion | None) -> i
 
 
 def explanations(
-    design: SequentialDesign, core: Core, suspicion: Suspicion | None
+    design: SequentialDesign, core: Core, suspicion: Suspicion | None, uses_q: Bools
 ) -> tuple[Explanation, ...]:
     """Reported explanations, the likeliest first; sets that differ in the loads only are one.
 
@@ -188,32 +190,56 @@ def explanations(
         The front end, and the core.
     suspicion
         The explanations.
+    uses_q : (N,)
+        Customers with a metered reactive power in the model: there the report is wrong, not the inverter.
     """
     if suspicion is None:
         return ()
-    found, p, inverters = suspicion.found, core.modes.size, design.plant.droop.tau.size
-    total: dict[bytes, float] = {}
-    for chosen, weight in zip(found.chosen, found.weight, strict=True):
-        key = chosen.tobytes()
-        total[key] = total.get(key, 0.0) + float(weight)
-    likely = sorted(((w, key) for key, w in total.items() if w >= LIKELY), key=lambda each: -each[0])
+    found, p = suspicion.found, core.modes.size
+    owner, last = design.plant.droop.customer, design.customers
     powers, phases = core.faults.powers, design.busbar_incidence.shape[1]
     used = core.model.phases(core.modes.at).any(axis=0)
-    out = []
-    for weight, key in likely[:SHOWN]:
-        chosen = np.frombuffer(key, dtype=np.bool_)
+    metered = uses_q[owner]
+    total: dict[tuple[bytes, ...], float] = {}
+    for chosen, weight in zip(found.chosen, found.weight, strict=True):
+        inverters, wrong = chosen[p + last : p + powers], chosen[p : p + last].copy()
+        wrong[owner[inverters & metered]] = True
         busbar = np.zeros(phases, dtype=np.bool_)
         busbar[used] = chosen[p + powers :]
-        out.append(
-            Explanation(
-                chosen[:p].copy(),
-                np.zeros(inverters, dtype=np.bool_),
-                weight,
-                chosen[p : p + powers].copy(),
-                busbar,
-            )
-        )
+        each = (chosen[:p], inverters & ~metered, wrong, busbar)
+        key = tuple(one.tobytes() for one in each)
+        total[key] = total.get(key, 0.0) + float(weight)
+    likely = sorted(((w, key) for key, w in total.items() if w >= LIKELY), key=lambda each: -each[0])
+    out = []
+    for weight, key in likely[:SHOWN]:
+        meters, inverters, wrong, busbar = (np.frombuffer(one, dtype=np.bool_) for one in key)
+        out.append(Explanation(meters, inverters, weight, wrong, busbar))
     return tuple(out)
+
+
+def certain_inverters(design: SequentialDesign, core: Core, suspicion: Suspicion, uses_q: Bools) -> Bools:
+    """Inverters without which nothing explains the readings, (m,).
+
+    Parameters
+    ----------
+    design, core, suspicion, uses_q
+        As in `explanations`.
+    """
+    found, first = suspicion.found, core.modes.size + design.customers
+    chosen = found.chosen[:, first : core.modes.size + core.faults.powers]
+    return np.asarray((found.weight @ ~chosen < DOUBT) & ~uses_q[design.plant.droop.customer])
+
+
+def inverter_amounts(design: SequentialDesign, core: Core, suspicion: Suspicion | None) -> Floats:
+    """Injections beyond the curves in the likeliest explanation, (m,), pu."""
+    out = np.zeros(design.plant.droop.tau.size)
+    if suspicion is not None and suspicion.found.chosen[0].any():
+        found, first = suspicion.found, core.modes.size + design.customers
+        at = np.flatnonzero(found.chosen[0])
+        mean, _ = amounts(found.problems[int(found.model[0])], found.chosen[0])
+        inside = (at >= first) & (at < core.modes.size + core.faults.powers)
+        out[at[inside] - first] = mean[inside]
+    return out
 
 
 def accused(core: Core, suspicion: Suspicion) -> Bools:
@@ -232,6 +258,40 @@ def certain_phases(core: Core, suspicion: Suspicion) -> Bools:
     """
     found, first = suspicion.found, core.modes.size + core.faults.powers
     return np.asarray(found.weight @ ~found.chosen[:, first:] < DOUBT)
+
+
+def share(  # noqa: PLR0917  # the core, and one report
+    design: SequentialDesign, core: Core, state: CoreState, j: int, a: float, uses_q: bool
+) -> tuple[float, float]:
+    """Evidence of the voltages on meter j with a reactive power `a` beyond the curve, pu, as `Share`.
+
+    With the report in the model, a false one is a fault of -a along the inverter's column, since any onset.
+    Without it, a true report is a fault of a. The onset that suits the fault best decides. Where readings are
+    missing, the information counts with the share of it that was read at this tick.
+    """
+    inverter = int(np.argmax(design.meter_of == j))
+    at = core.modes.size + design.customers + inverter
+    W, onsets = core.faults.W[:, [at]], state.detector.onsets
+    rows = np.flatnonzero(onsets.used & ~onsets.ramp)
+    now = replace(signatures.scores(core.modes, onsets, state.static, rows), share=None)
+    y, F = now.of(W, W * W)
+    update = state.update
+    if update is not None and update.exact is not None:
+        read, n = 0.0, update.exact.rows
+        if n.size:
+            felt, _ = lapack.dtrtrs(update.exact.half, core.modes.back[n] @ W, lower=True)
+            read = float((felt * felt).sum())
+        F = F * min(1.0, read / max(float(W[:, 0] ** 2 @ (1.0 / update.variance)), _TINY))
+    fault = -a if uses_q else a
+    gain = 2.0 * fault * y[:, 0] - fault * fault * F[:, 0]
+    best = int(gain.argmax())
+    # Deviation of the voltages if the inverter is right: with its own injection in the model.
+    rest = y[best, 0] - fault * F[best, 0] if uses_q else y[best, 0]
+    sigmas = float(abs(rest) / np.sqrt(max(F[best, 0], _TINY)))
+    return probability(float(-gain[best] if uses_q else gain[best])), sigmas
+
+
+_TINY = float(np.finfo(np.float64).tiny)
 
 
 # --- Verdict ---
@@ -255,6 +315,8 @@ class Inputs:
         What explains it.
     settled
         The observer of the inverters has settled.
+    inverters : (m,)
+        Inverters named as manipulated.
     busbar, metered : (b,)
         Phases with a meter named as manipulated, and with a busbar voltage in use.
     busbar_off : (b,)
@@ -270,6 +332,7 @@ class Inputs:
     explanations: tuple[Explanation, ...]
     suspicion: Suspicion | None = field(repr=False)
     settled: bool
+    inverters: Bools
     busbar: Bools
     metered: Bools
     busbar_off: Floats
@@ -306,6 +369,7 @@ def verdict(design: SequentialDesign, now: Inputs, estimate: Estimate) -> Findin
     finding = _busbar(design, now, estimate, finding)
     if now.suspected:
         finding = _suspected(design, now, finding)
+    finding = _inverters(design, now, finding)
     return _clock(design, now, tested, _unread_powers(design, now, estimate, finding))
 
 
@@ -342,6 +406,30 @@ def _busbar(design: SequentialDesign, now: Inputs, estimate: Estimate, finding: 
     return Decision.ATTACKED, Cause.RESIDUALS, f"Manipulated: the meter of the busbar; it {off}."
 
 
+def with_open_cases(design: SequentialDesign, finding: Finding, cases: tuple[Explanation, ...]) -> Finding:
+    """UNDECIDED where a metered reactive power leaves its curve, and the voltages do not tell why."""
+    decision, cause, reason = finding
+    if not cases or cause not in (Cause.AGREEMENT, Cause.SILENT_METERS, Cause.RESIDUALS):
+        return finding
+    sentence = explanations_sentence(design, cases)
+    if cause is Cause.RESIDUALS:
+        return decision, cause, f"{reason} {sentence}"
+    return Decision.UNDECIDED, Cause.AMBIGUOUS, sentence
+
+
+def _inverters(design: SequentialDesign, now: Inputs, finding: Finding) -> Finding:
+    """ATTACKED where an inverter is named."""
+    decision, cause, reason = finding
+    if not any_of(now.inverters) or cause in (Cause.SETTLING, Cause.DESIGN_INVALID):
+        return finding
+    plant = design.plant
+    owners = ", ".join(plant.feeder.customers[c] for c in plant.droop.customer[now.inverters])
+    if decision is Decision.ATTACKED:
+        return decision, cause, f"{reason} Manipulated, too: the inverters of {owners}."
+    sentence = f"Manipulated: the inverters of {owners}; their reactive power is not that of their curves."
+    return Decision.ATTACKED, Cause.RESIDUALS, sentence
+
+
 def _suspected(design: SequentialDesign, now: Inputs, finding: Finding) -> Finding:
     """UNDECIDED where the readings disagree and no meter is named; a sentence more where one is."""
     decision, cause, reason = finding
@@ -356,7 +444,7 @@ def _suspected(design: SequentialDesign, now: Inputs, finding: Finding) -> Findi
     if (
         len(some) == 1
         and not some[0].meters.any()
-        and some[0].powers.sum() == 1
+        and some[0].powers.sum() + some[0].inverters.sum() == 1
         and now.suspicion is not None
     ):
         sentence = _one_power(design, now.suspicion, some[0])
@@ -369,19 +457,22 @@ def _suspected(design: SequentialDesign, now: Inputs, finding: Finding) -> Findi
 
 
 def _accuses(explanation: Explanation) -> bool:
-    return any_of(explanation.meters) or any_of(explanation.powers) or any_of(explanation.busbar)
+    return any(
+        map(any_of, (explanation.meters, explanation.inverters, explanation.powers, explanation.busbar))
+    )
 
 
 def _one_power(design: SequentialDesign, suspicion: Suspicion, one: Explanation) -> str:
-    """Sentence about a single wrong power; empty where its amount is unknown."""
-    found, customer = suspicion.found, int(np.flatnonzero(one.powers)[0])
-    p = one.meters.size
+    """Sentence about a single wrong power or inverter; empty where its amount is unknown."""
+    found, p = suspicion.found, one.meters.size
+    # Inverters follow the customers.
+    power = int(np.flatnonzero(np.concatenate([one.powers, one.inverters]))[0])
     for chosen, model in zip(found.chosen, found.model, strict=True):
         at = np.flatnonzero(chosen)
-        if at.size == 1 and at[0] == p + customer:
+        if at.size == 1 and at[0] == p + power:
             mean, _ = amounts(found.problems[int(model)], chosen)
             # A missing injection lowers the voltages: the residual is that of the true power.
-            return fault_sentence(design, customer, float(mean[0]))
+            return fault_sentence(design, power, float(mean[0]))
     return ""
 
 

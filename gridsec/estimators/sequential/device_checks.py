@@ -32,6 +32,7 @@ chong2020 (16) to (18) for the curves; docs/theory-sequential.md, sections 4 and
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -286,10 +287,16 @@ class ReportedPowers:
     trusted: Bools  # (p,) available meters, trusted for long enough that the observer followed them
     x: Floats  # (m,) observed injections, pu
     x_error: Floats  # (m,) largest errors of x, pu
-    posterior: (
-        Posterior | None
-    )  # posterior of the trusted meters on the longest scale of at most `LONGEST_MEAN` ticks
-    loo: LeaveOneOut | None  # its leave-one-out residuals
+    residual: Floats  # (p,) residuals by the other readings, squared pu
+    std: Floats  # (p,) their standard deviations, squared pu
+    share: Share  # evidence of the voltages
+
+
+Share = Callable[[int, float, bool], tuple[float, float]]
+"""Evidence of the voltages on a report, by meter, amount of its deviation, pu, and use of it by the model.
+
+Results: probability that the report is true and the inverter wrong, for even prior odds; standard deviations
+by which the voltages deviate along the inverter's column if the inverter is right."""
 
 
 def check_inverters(design: SequentialDesign, before: InverterChecks, now: ReportedPowers) -> InverterChecks:
@@ -297,16 +304,14 @@ def check_inverters(design: SequentialDesign, before: InverterChecks, now: Repor
     droop, at, size = design.plant.droop, design.plant.meters, design.customers
     own = np.bincount(droop.customer, minlength=size) > 0
     asked = now.reports_q[at] & now.trusted & own[at]
-    if now.posterior is None or now.loo is None:
-        return before
     if not (any_of(asked) or any_of(before.count)):
         return before if before.idle else no_checks(at.size, droop.tau.size)
     x, error, slope, span = (
         droop.per_customer(of, size)[at] for of in (now.x, now.x_error, droop.slope, droop.span)
     )
-    frame, loo = now.frame, now.loo
+    frame = now.frame
     amount = np.where(asked, frame.q_net[at] - frame.q[at] - x, 0.0)
-    other = np.minimum(span, slope * (np.abs(loo.residual) + design.sigmas[0] * loo.std))
+    other = np.minimum(span, slope * (np.abs(now.residual) + design.sigmas[0] * now.std))
     room = frame.q_error[at] + frame.q_net_error[at] + error + other
     disagrees = asked & (np.abs(amount) > room)
     count = np.where(
@@ -317,7 +322,7 @@ def check_inverters(design: SequentialDesign, before: InverterChecks, now: Repor
     amount = np.where(asked, amount, before.amount) * lasts
     for j in np.flatnonzero(lasts).tolist():
         uses_q = bool(asked[j] and now.uses_q[at[j]])
-        share[j], sigmas = _share(design, now.posterior, loo.weights, j, float(amount[j]), uses_q=uses_q)
+        share[j], sigmas = now.share(j, float(amount[j]), uses_q)
         beyond[j] |= bool(asked[j] and sigmas > design.sigmas[0])
     # Without reports the accusation stays until the voltages contradict it.
     over = lasts & ~asked & (share <= 1.0 / design.options.like)
@@ -330,13 +335,12 @@ def check_inverters(design: SequentialDesign, before: InverterChecks, now: Repor
     return InverterChecks(count, lasts, amount, share, sure, observable)
 
 
-def _share(
-    design: SequentialDesign, now: Posterior, weights: Floats, j: int, a: float, *, uses_q: bool
+def posterior_share(  # noqa: PLR0917  # one posterior, and one report
+    design: SequentialDesign, now: Posterior, weights: Floats, j: int, a: float, uses_q: bool
 ) -> tuple[float, float]:
-    """Probability that a report is true and the inverter wrong, for even prior odds.
+    """Evidence of the voltages by a posterior and its leave-one-out weights (p,), as `Share`.
 
-    And the standard deviations by which the voltages deviate along its column if the inverter is right. Both
-    are needed: a test at every tick for years meets an unlikely ratio.
+    Both numbers are needed: a test at every tick for years meets an unlikely ratio.
     """
     inverter = int(np.argmax(design.meter_of == j))
     column = design.faults.columns(np.array([design.customers + inverter]))[now.prior.meters, 0]
@@ -344,10 +348,14 @@ def _share(
     along, form = float(column @ weights), float(column[at] @ Q @ column[at])
     if uses_q:
         along += a * form  # as if x were true
-    worse = 2.0 * a * along - a * a * form
-    share = 1.0 / (1.0 + np.exp(-0.5 * np.clip(worse, -_MAX_LOG_RATIO, _MAX_LOG_RATIO)))
     # Inverters at the busbar have zero sensitivity.
-    return float(share), abs(along) / max(float(np.sqrt(form)), np.finfo(np.float64).tiny)
+    sigmas = abs(along) / max(float(np.sqrt(form)), np.finfo(np.float64).tiny)
+    return probability(2.0 * a * along - a * a * form), sigmas
+
+
+def probability(worse: float) -> float:
+    """Probability of a hypothesis against one with a chi-square higher by `worse`, for even prior odds."""
+    return float(1.0 / (1.0 + np.exp(-0.5 * np.clip(worse, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))))
 
 
 _MAX_LOG_RATIO = 1000.0

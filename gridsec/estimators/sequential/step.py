@@ -20,6 +20,7 @@ between its values at two successive frames (docs/theory-detection.md for the la
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -34,6 +35,7 @@ from gridsec.estimators.sequential.device_checks import (
     InverterChecks,
     ReportedPowers,
     check_inverters,
+    posterior_share,
 )
 from gridsec.estimators.sequential.identify import Identification, confirm, ended, identify, supported
 from gridsec.estimators.sequential.measurements import (
@@ -286,9 +288,12 @@ def _checked_inverters(
     trusted = measured.available & identified.trust.trusted & (identified.trust.ticks_suspect == 0)
     s = max(sum(length <= LONGEST_MEAN for length in design.lengths) - 1, 0)
     test, posterior = identified.tests[s], identified.posteriors[s]
-    loo, error = None if test is None else test.loo, predicted.injection_error.error
+    if test is None or posterior is None:
+        return before
+    loo, error = test.loo, predicted.injection_error.error
     frame, reports_q, uses_q = measured.frame, measured.reports_q, measured.uses_q
-    now = ReportedPowers(frame, reports_q, uses_q, trusted, predicted.x, error, posterior, loo)
+    share = partial(posterior_share, design, posterior, loo.weights)
+    now = ReportedPowers(frame, reports_q, uses_q, trusted, predicted.x, error, loo.residual, loo.std, share)
     return check_inverters(design, before, now)
 
 
