@@ -363,11 +363,11 @@ class FeederMonitor:
 
     def _unmeasured(self, book: AlarmBook, tick: Tick) -> list[Condition]:
         """Unknown conditions of alarms of clocks without a measured offset, as after a restart."""
-        if tick.clocks_known is None:
+        measured = tick.clocks_known
+        if measured is None:
             return []
-        measured = {BUSBAR if source is None else source for source in tick.clocks_known}
         entries = (key for key in book.entries if key[0] is AlarmKind.CLOCK_OFFSET)
-        return self._unknown(key for key in entries if key[1] not in measured)
+        return self._unknown(key for key in entries if (None if key[1] == BUSBAR else key[1]) not in measured)
 
     def _unknown(self, keys: Iterable[tuple[AlarmKind, str | None]]) -> list[Condition]:
         return [Condition(kind, self.name, meter, Severity.MAJOR, known=False) for kind, meter in keys]

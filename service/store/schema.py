@@ -44,7 +44,16 @@ class StoreUnavailable(GridsecError):
     @property
     def public(self) -> str:
         """Sentence for clients, without address and message of the database."""
-        return f"the database cannot be used ({self.code}); the log of the service has the details"
+        text = _PUBLIC.get(self.code, "the database cannot be used")
+        return f"{text} ({self.code}); the log of the service has the details"
+
+
+_PUBLIC = {
+    "outcome-unknown": "the outcome of the change is not known yet",
+    "stopping": "the service is stopping",
+    "write-under-way": "the previous write has not ended",
+}
+"""Sentences for clients by code."""
 
 
 class OutcomeUnknown(StoreUnavailable):
