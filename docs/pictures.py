@@ -49,7 +49,7 @@ ATTACKED_S = 70.0
 SIZES = {"desktop": (1400, 900), "phone": (390, 844)}
 SCHEMES = ("light", "dark")
 COLOURS, EXACT, APART = 256, 32, 20
-"""Colours of a picture, the most frequent of them exact; distance of the others, sum over red, green and blue."""
+"""Colours of a picture; the most frequent ones are exact, the others apart, sum over red, green and blue."""
 CALM_S = 5
 """Interval of the readings of stations without an event, s: a busy machine must not shed feeders."""
 
