@@ -1,8 +1,11 @@
-// Labels of suspects: each stands beside its symbol, at the first place where it covers no symbol and no label;
-// where there is none, no suspect and no label.
+// Labels of suspects: each stands beside its symbol, where it covers no suspect and no label, and few other symbols;
+// a near place is better than a free one far away.
 
 const CHARACTER = 7.4; // Width of a bold character at 12 px, px.
 const LINE = 13; // Height of a line, px.
+const FAR = 8; // A label that is so much farther away may cover a symbol less, px.
+
+const least = (all, cost) => all.reduce((best, one) => (best === undefined || cost(one) < cost(best) ? one : best), undefined);
 
 const over = (a, b) => a.x < b.x + b.width && b.x < a.x + a.width && a.y < b.y + b.height && b.y < a.y + a.height;
 
@@ -32,7 +35,8 @@ export function placeLabels(marks, others, { width, height }) {
     });
     const inside = (b) => b.x >= 0 && b.y >= 0 && b.x + b.width <= width && b.y + b.height <= height;
     const apart = choices.filter((c) => inside(box(c)) && !taken.some((other, k) => k !== own && over(box(c), other)));
-    const free = apart.find((c) => !symbols.some((other) => over(box(c), other))) ?? apart[0] ?? choices.find((c) => inside(box(c))) ?? choices[0];
+    const cost = (c) => symbols.filter((other) => over(box(c), other)).length + Math.hypot(c.x, c.y) / FAR;
+    const free = least(apart, cost) ?? choices.find((c) => inside(box(c))) ?? choices[0];
     taken.push(box(free));
     return free;
   });

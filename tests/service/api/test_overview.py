@@ -80,6 +80,9 @@ def test_only_present_readings_make_a_verdict(village: type) -> None:
     assert status_of({}, 5.0) is FeederStatus.NO_DATA
     assert status_of(now, 5.0, failed=True) is FeederStatus.NOT_MONITORED
     assert status_of(now, None) is FeederStatus.ATTACKED
+    for cause in ("overload", "no-owner"):
+        for more in ({}, {"model_only": True}, {"age_s": 99.0}):
+            assert status_of({**now, "cause": cause, **more}, 5.0) is FeederStatus.UNDECIDED
 
 
 def test_the_list_over_http(setup: Setup) -> None:
