@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated
@@ -54,6 +54,16 @@ class WriterLost(StoreUnavailable):
     code = "writer-lost"
 
 
+class LeaseLost(StoreUnavailable):
+    """Another worker has claimed the shards of these feeders, or may have; nothing was written."""
+
+    code = "lease-lost"
+
+    def __init__(self, worker: str, feeders: Collection[str]) -> None:
+        self.feeders = frozenset(feeders)
+        super().__init__(f"worker {worker!r} has lost the leases of {', '.join(sorted(feeders))}")
+
+
 @dataclass(frozen=True, slots=True)
 class AlarmEvent:
     """One event of an alarm, and the alarm after it."""
@@ -78,6 +88,8 @@ class Rejected:
 
 META = sa.MetaData()
 SEQ = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
+
+_MIGRATION_LOCK = 0x6772_6964_6D69_6700
 
 VERSION = sa.Table("schema_version", META, sa.Column("version", sa.Integer, nullable=False))
 ALARM = sa.Table(
@@ -249,6 +261,23 @@ WRITER = sa.Table(
     sa.Column("checks", sa.BigInteger, nullable=False),
 )
 """One row. A store with a replaced `owner` writes nothing more."""
+WORKER = sa.Table(
+    "worker",
+    META,
+    # Times of the database's clock, Unix s.
+    sa.Column("number", SEQ, primary_key=True, autoincrement=True),
+    sa.Column("name", sa.String(64), nullable=False),
+    sa.Column("registered", sa.Double, nullable=False),
+    sa.Column("until", sa.Double, nullable=False),
+    sqlite_autoincrement=True,
+)
+SHARD = sa.Table(
+    "shard",
+    META,
+    sa.Column("shard", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("epoch", sa.BigInteger, nullable=False),  # number of claims
+    sa.Column("owner", SEQ),  # number of a worker; null: released
+)
 
 
 def _add_commissioning(connection: sa.Connection) -> None:
@@ -310,6 +339,11 @@ def _add_incidents(connection: sa.Connection) -> None:
         connection.execute(ALARM.update().where(ALARM.c.id == number).values(words=words))
 
 
+def _add_workers(connection: sa.Connection) -> None:
+    for table in (WORKER, SHARD):
+        table.create(connection)
+
+
 MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
     _add_commissioning,
     _add_distrust,
@@ -317,6 +351,7 @@ MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
     _add_writer,
     _add_rollup,
     _add_incidents,
+    _add_workers,
 )
 """Step k migrates schema version k + 1 to k + 2. A new database starts at the newest version."""
 
@@ -327,6 +362,9 @@ def migrate(connection: sa.Connection, name: str) -> None:
     Raises StoreUnavailable if the database is newer than this program.
     """
     newest = 1 + len(MIGRATIONS)
+    if connection.dialect.name == "postgresql":
+        # Several workers may open the database at once.
+        connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_MIGRATION_LOCK)))
     if not sa.inspect(connection).has_table(VERSION.name):
         META.create_all(connection)
         connection.execute(VERSION.insert().values(version=newest))

@@ -20,6 +20,7 @@ from typing import Any, cast
 import jwt
 import numpy as np
 import pandas as pd
+import psycopg
 import pytest
 import sqlalchemy as sa
 import zenoh
@@ -63,7 +64,7 @@ from service.ingest.zenoh_bus import MeterClient
 from service.notify.post import permitted
 from service.notify.targets import read_targets
 from service.settings import refuse_exposed, settings
-from service.store import Store, backup, committer, schema
+from service.store import Store, backup, committer, leases, schema
 from service.store.access import AccessStore
 from service.store.committer import Batch
 from service.store.connect import NoAnswer, WriterSession
@@ -279,6 +280,14 @@ def session_ended(_: Path, __: Patch) -> None:
     lost._ended, lost._server = True, "noon"
     made = SimpleNamespace(execute=lambda _: SimpleNamespace(fetchone=lambda: ("noon",)))
     lost._take_lock(cast(Any, made))
+
+
+def single_process(_: Path, __: Patch) -> None:
+    def execute(statement: str, _: object) -> None:
+        if "pg_advisory_lock_shared" in statement:
+            raise psycopg.errors.LockNotAvailable("canceling statement due to lock timeout")
+
+    leases.share_database(cast(Any, SimpleNamespace(execute=execute)), "postgresql://server/g", 0.0)
 
 
 def defect(_: Path, __: Patch) -> None:
@@ -611,6 +620,12 @@ CALLS: dict[str, Call] = {
     "removed lock": with_store(lock_removed),
     "second writer": with_store(another_writer),
     "session that the server ends": session_ended,
+    "workers beside a service without workers": single_process,
+    "workers with SQLite": lambda _, __: leases.Leases("sqlite:///g.db", "a"),
+    "second worker of a name": lambda _, __: leases._View({1: "a"}, frozenset({1}), 0.0, {}).refuse(
+        "a", "postgresql://server/g"
+    ),
+    "shards of another worker": lambda _, __: refuse(schema.LeaseLost("a", ["village", "town"])),
     "command while writes fail": lambda _, __: committer.Committer._command(
         cast(Any, SimpleNamespace(problem="cannot write g.db: disk full")), cast(Any, None)
     ),

@@ -183,7 +183,8 @@ OLD_LAYOUT = sa.Table(
 
 def put_back_incidents(connection: sa.Connection) -> None:
     """Make a database one of version 5."""
-    for table in (schema.ROLLUP, schema.INCIDENT_EVENT, schema.INCIDENT, schema.SHELF, schema.WORK):
+    incidents = (schema.INCIDENT_EVENT, schema.INCIDENT, schema.SHELF, schema.WORK)
+    for table in (schema.WORKER, schema.SHARD, schema.ROLLUP, *incidents):
         table.drop(connection)
     connection.exec_driver_sql("DROP INDEX alarm_by_incident")
     for column in ("incident", "work", "words"):
