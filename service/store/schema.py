@@ -372,7 +372,7 @@ MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
 )
 """Step k migrates schema version k + 1 to k + 2. A new database starts at the newest version.
 
-Steps after version 8 only add tables, and columns that may be null or have a default of the server: workers
+Steps after `_add_workers` only add tables, and columns that may be null or have a default of the server: workers
 of the earlier version go on meanwhile.
 """
 
