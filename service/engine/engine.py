@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
@@ -54,8 +54,8 @@ from service.report.tick_state import TickState
 from service.store import Rejected, Store
 from service.store.committer import Committer, Executor, Wish, alarm_key, incident_key, inline
 from service.store.schema import CommissioningEvent
+from service.store.series import Mark, mark, worth_keeping
 from service.store.state_codec import KeptInvalid, StateSnapshot, decode_signed, encode_signed
-from service.store.store import Mark, mark, worth_keeping
 
 BAD_PER_SOURCE = 5
 """Bad readings of one round, key and reason that are stored separately; the others become one entry."""
@@ -375,13 +375,14 @@ class Engine:
         known = {name: known_of(monitor.site) for name, monitor in self.monitors.items()}
         self._wire = Wire(known, self.config.prefix, self.config.max_payload, self.config.meter_keys)
 
-    def begin(self) -> None:
+    def begin(self, given: Collection[str] = ()) -> None:
         """Set the replies for standing alarms; publish the stored alarms of an earlier process.
 
         Alarms of feeders that are neither monitored nor stored any more are cleared here: no monitor does it.
+        `given` are further feeders, which this process monitors later.
         """
-        ours, t = self.monitors.keys() | self.unloaded.keys() | self.store.feeders().keys(), self._wall()
-        standing = self.store.active()
+        ours, t = {*self.monitors, *self.unloaded, *self.store.feeders(), *given}, self._wall()
+        standing = [alarm for alarm in self.store.active() if self.store.mine(alarm.feeder)]
         left_out = [alarm for alarm in standing if alarm.feeder not in ours]
         self.committer.waiting.add(transitions=close(left_out, t, NOT_WATCHED))
         if self.committer.publisher is not None:
@@ -389,7 +390,7 @@ class Engine:
                 if alarm.feeder in ours:
                     self.committer.publisher.answer(alarm_key(alarm), msgspec.json.encode(alarm_json(alarm)))
             for event in self.store.open_incident_events():
-                if event.incident.feeder in ours:
+                if event.incident.feeder in ours and self.store.mine(event.incident.feeder):
                     payload = msgspec.json.encode(event_json(event))
                     self.committer.publisher.answer(incident_key(event.incident), payload)
         for name in self.unloaded:

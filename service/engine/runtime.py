@@ -136,7 +136,7 @@ class Runtime:
         """
         self._loop = asyncio.get_running_loop()
         try:
-            await self._loop.run_in_executor(self._writer, self._engine.begin)
+            await self._loop.run_in_executor(self._writer, self._engine.begin, self._given)
             for monitor in self._engine.monitors.values():
                 design_jobs.begin(monitor, lambda install: self._in_loop(partial(self._hand_over, install)))
             while not self._stopping:

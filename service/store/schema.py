@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated
@@ -68,6 +68,16 @@ class WriterLost(StoreUnavailable):
     code = "writer-lost"
 
 
+class LeaseLost(StoreUnavailable):
+    """Another worker has claimed the shards of these feeders, or may have; nothing was written."""
+
+    code = "lease-lost"
+
+    def __init__(self, worker: str, feeders: Collection[str]) -> None:
+        self.feeders = frozenset(feeders)
+        super().__init__(f"worker {worker!r} has lost the leases of {', '.join(sorted(feeders))}")
+
+
 @dataclass(frozen=True, slots=True)
 class AlarmEvent:
     """One event of an alarm, and the alarm after it."""
@@ -92,6 +102,10 @@ class Rejected:
 
 META = sa.MetaData()
 SEQ = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
+
+OPEN_S = 60.0
+"""Time limit of a call while the database is opened, s: a migration may take longer than a write."""
+_MIGRATION_LOCK = 0x6772_6964_6D69_6700
 
 VERSION = sa.Table("schema_version", META, sa.Column("version", sa.Integer, nullable=False))
 ALARM = sa.Table(
@@ -226,6 +240,15 @@ FEEDER = sa.Table(
     META,
     sa.Column("name", sa.String(64), primary_key=True),
     sa.Column("tables", sa.Text, nullable=False),
+    sa.Column(
+        "version", sa.BigInteger, nullable=False, server_default="0"
+    ),  # `FEEDER_CHANGES` after its change
+)
+FEEDER_CHANGES = sa.Table(
+    "feeder_changes",
+    META,
+    # One row: number of feeders that were added, changed or removed over REST.
+    sa.Column("number", sa.BigInteger, nullable=False),
 )
 
 
@@ -262,8 +285,26 @@ WRITER = sa.Table(
     sa.Column("owner", sa.String(32), nullable=False),
     sa.Column("commits", sa.BigInteger, nullable=False),
     sa.Column("checks", sa.BigInteger, nullable=False),
+    sa.Column("worker", SEQ),  # its number in `worker`; null: the only writer
 )
-"""One row. A store with a replaced `owner` writes nothing more."""
+"""One row, or one for each worker. A store without its row writes nothing more."""
+WORKER = sa.Table(
+    "worker",
+    META,
+    # Times of the database's clock, Unix s.
+    sa.Column("number", SEQ, primary_key=True, autoincrement=True),
+    sa.Column("name", sa.String(64), nullable=False),
+    sa.Column("registered", sa.Double, nullable=False),
+    sa.Column("until", sa.Double, nullable=False),
+    sqlite_autoincrement=True,
+)
+SHARD = sa.Table(
+    "shard",
+    META,
+    sa.Column("shard", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("epoch", sa.BigInteger, nullable=False),  # number of claims
+    sa.Column("owner", SEQ),  # number of a worker; null: released
+)
 
 
 def _add_commissioning(connection: sa.Connection) -> None:
@@ -311,7 +352,9 @@ def _add_digest(connection: sa.Connection) -> None:
 
 
 def _add_writer(connection: sa.Connection) -> None:
-    WRITER.create(connection)
+    connection.exec_driver_sql(
+        "CREATE TABLE writer (owner VARCHAR(32) NOT NULL, commits BIGINT NOT NULL, checks BIGINT NOT NULL)"
+    )
 
 
 def _add_incidents(connection: sa.Connection) -> None:
@@ -329,6 +372,14 @@ def _add_signed(connection: sa.Connection) -> None:
     SIGNED.create(connection)
 
 
+def _add_workers(connection: sa.Connection) -> None:
+    connection.exec_driver_sql("ALTER TABLE writer ADD COLUMN worker BIGINT")
+    connection.exec_driver_sql("ALTER TABLE feeder ADD COLUMN version BIGINT NOT NULL DEFAULT 0")
+    for table in (WORKER, SHARD, FEEDER_CHANGES):
+        table.create(connection)
+    connection.execute(FEEDER_CHANGES.insert().values(number=0))
+
+
 MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
     _add_commissioning,
     _add_distrust,
@@ -337,8 +388,13 @@ MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
     _add_rollup,
     _add_incidents,
     _add_signed,
+    _add_workers,
 )
-"""Step k migrates schema version k + 1 to k + 2. A new database starts at the newest version."""
+"""Step k migrates schema version k + 1 to k + 2. A new database starts at the newest version.
+
+Steps after `_add_workers` only add tables, and columns that may be null or have a default of the server.
+Workers of the earlier version go on meanwhile.
+"""
 
 
 def migrate(connection: sa.Connection, name: str) -> None:
@@ -347,9 +403,15 @@ def migrate(connection: sa.Connection, name: str) -> None:
     Raises StoreUnavailable if the database is newer than this program.
     """
     newest = 1 + len(MIGRATIONS)
+    if connection.dialect.name == "postgresql":
+        # Several workers may open the database at once, and a migration takes longer than a write.
+        for limit in ("lock_timeout", "idle_in_transaction_session_timeout"):
+            connection.exec_driver_sql(f"SET LOCAL {limit} = '{OPEN_S:g}s'")
+        connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_MIGRATION_LOCK)))
     if not sa.inspect(connection).has_table(VERSION.name):
         META.create_all(connection)
         connection.execute(VERSION.insert().values(version=newest))
+        connection.execute(FEEDER_CHANGES.insert().values(number=0))
         return
     version = int(connection.execute(sa.select(VERSION.c.version)).scalar_one())
     if version > newest:

@@ -20,6 +20,7 @@ from typing import Any, cast
 import jwt
 import numpy as np
 import pandas as pd
+import psycopg
 import pytest
 import sqlalchemy as sa
 import zenoh
@@ -63,10 +64,10 @@ from service.ingest.zenoh_bus import MeterClient
 from service.notify.post import permitted
 from service.notify.targets import read_targets
 from service.settings import refuse_exposed, settings
-from service.store import Store, backup, committer, schema
+from service.store import Store, backup, committer, leases, schema
 from service.store.access import AccessStore
 from service.store.committer import Batch
-from service.store.connect import NoAnswer, WriterSession
+from service.store.connect import NoAnswer, WriterSession, share_database
 from service.store.state_codec import decode, decode_distrust, encode, encode_distrust, fingerprint
 from tests.service.stored import T0, an_alarm, raised
 
@@ -275,10 +276,23 @@ def not_a_database(place: Path, _: Patch) -> None:
 
 
 def session_ended(_: Path, __: Patch) -> None:
-    lost = WriterSession()
+    lost = WriterSession("postgresql://server/g")
     lost._ended, lost._server = True, "noon"
     made = SimpleNamespace(execute=lambda _: SimpleNamespace(fetchone=lambda: ("noon",)))
     lost._take_lock(cast(Any, made))
+
+
+def workers_running(_: Path, __: Patch) -> None:
+    made = SimpleNamespace(execute=lambda *_: SimpleNamespace(fetchone=lambda: (True,)))
+    WriterSession("postgresql://server/g")._refuse_workers(cast(Any, made))
+
+
+def single_process(_: Path, __: Patch) -> None:
+    def execute(statement: str, _: object) -> None:
+        if "pg_advisory_lock_shared" in statement:
+            raise psycopg.errors.LockNotAvailable("canceling statement due to lock timeout")
+
+    share_database(cast(Any, SimpleNamespace(execute=execute)), "postgresql://server/g", 0.0)
 
 
 def defect(_: Path, __: Patch) -> None:
@@ -611,6 +625,13 @@ CALLS: dict[str, Call] = {
     "removed lock": with_store(lock_removed),
     "second writer": with_store(another_writer),
     "session that the server ends": session_ended,
+    "workers beside a service without workers": single_process,
+    "service without workers beside workers": workers_running,
+    "workers with SQLite": lambda _, __: leases.Leases("sqlite:///g.db", "a"),
+    "second worker of a name": lambda _, __: leases._View({1: "a"}, frozenset({1}), 0.0, {}).refuse(
+        "a", "postgresql://server/g"
+    ),
+    "shards of another worker": lambda _, __: refuse(schema.LeaseLost("a", ["village", "town"])),
     "command while writes fail": lambda _, __: committer.Committer._command(
         cast(Any, SimpleNamespace(problem="cannot write g.db: disk full")), cast(Any, None)
     ),
