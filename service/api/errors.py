@@ -21,7 +21,7 @@ from service.access.identity import IssuerUnavailable, NotAuthenticated, NotPerm
 from service.alarms.incidents import IncidentChanged, IncidentUnknown, ShelfUnknown, WorkUnknown, WrongTime
 from service.alarms.state_machine import AlarmUnknown, AlreadyAcknowledged, NotAcknowledged, RaisedAgain
 from service.engine.commissioning import NothingToLearn
-from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, TooManyFeeders
+from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, NoOwner, TooManyFeeders
 from service.store import OutcomeUnknown, StoreUnavailable
 
 
@@ -208,6 +208,7 @@ _STATUS: dict[type[GridsecError], int] = {
     IssuerUnavailable: 503,
     TooManyFailures: 429,
     FeederNotLoaded: 503,
+    NoOwner: 503,
     StoreUnavailable: 503,
     GridsecError: 500,
 }
@@ -222,6 +223,8 @@ def handlers() -> dict[type[Exception], Handler]:
 def _gridsec_handler(status: int) -> Handler:
     async def handler(request: Request, error: Exception) -> Response:
         more: dict[str, Any] = {}
+        if isinstance(error, NoOwner):
+            more["code"] = error.code
         if isinstance(error, FeederInvalid):
             more["problems"] = list(error.problems)
         if isinstance(error, OutcomeUnknown):

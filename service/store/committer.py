@@ -452,14 +452,27 @@ class Committer:
             for _ in job.incidents:
                 self._incidents_done.popleft()
         if done.incidents_after is not None:
-            self._incidents.extend(done.incidents)
+            self._queue_incidents(done.incidents)
             if done.incidents:
                 self._stored()
             self._incidents_after = done.incidents_after
         if done.page is not None:
-            self._unpublished.extend((event.seq, event.alarm) for event in done.page)
+            self._queue_events(done.page)
             full = len(done.page) == OUTBOX_PAGE
             self._outbox_after = done.page[-1].seq if full else None
+
+    def take_over(self, events: Iterable[AlarmEvent], incidents: Iterable[IncidentEvent]) -> None:
+        """Queue stored events that the earlier owner of their feeder has not published."""
+        self._queue_events(events)
+        self._queue_incidents(incidents)
+
+    def _queue_events(self, events: Iterable[AlarmEvent]) -> None:
+        known = {number for number, _ in self._unpublished} | set(self._published)
+        self._unpublished.extend((event.seq, event.alarm) for event in events if event.seq not in known)
+
+    def _queue_incidents(self, events: Iterable[IncidentEvent]) -> None:
+        known = {event.seq for event in self._incidents} | set(self._incidents_done)
+        self._incidents.extend(event for event in events if event.seq not in known)
 
     def _answer(self, command: Command, done: WriteResult) -> None:
         """Pass a command its result. Stored data stay stored, whatever failed afterwards."""

@@ -397,19 +397,28 @@ class IncidentReader:
         with self._read() as connection:
             return [_event(row) for row in connection.execute(query).mappings()]
 
-    def open_incident_events(self) -> list[IncidentEvent]:
-        """Return the newest event of each open incident."""
+    def open_incident_events(self, *, feeder: str | None = None) -> list[IncidentEvent]:
+        """Return the newest event of each open incident, of one feeder or (None) of all."""
         e, i = INCIDENT_EVENT.c, INCIDENT.c
         open_ones = sa.select(i.id).where(i.state != str(IncidentState.CLEARED))
+        if feeder is not None:
+            open_ones = open_ones.where(i.feeder == feeder)
         newest = sa.select(sa.func.max(e.seq)).where(e.incident_id.in_(open_ones)).group_by(e.incident_id)
         with self._read() as connection:
             rows = connection.execute(sa.select(INCIDENT_EVENT).where(e.seq.in_(newest)).order_by(e.seq))
             return [_event(row) for row in rows.mappings()]
 
-    def incidents_unpublished(self, *, after: int = 0, limit: int = 1000) -> list[IncidentEvent]:
-        """Return the events of incidents that are not published on zenoh, oldest first."""
+    def incidents_unpublished(
+        self, *, after: int = 0, limit: int = 1000, feeder: str | None = None
+    ) -> list[IncidentEvent]:
+        """Return the events of incidents that are not published on zenoh, oldest first.
+
+        `feeder` None: of all feeders.
+        """
         e = INCIDENT_EVENT.c
         query = sa.select(INCIDENT_EVENT).where(e.published.is_(False), e.seq > after)
+        if feeder is not None:
+            query = query.where(e.feeder == feeder)
         with self._read() as connection:
             return [_event(row) for row in connection.execute(query.order_by(e.seq).limit(limit)).mappings()]
 

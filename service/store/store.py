@@ -182,9 +182,16 @@ class Reader(IncidentReader):
         with self._read() as connection:
             return [_event(row) for row in connection.execute(query).mappings()]
 
-    def outbox_pending(self, limit: int = 1000, *, after: int = 0) -> list[AlarmEvent]:
-        """Return the unpublished events, oldest first. `after` restricts to events with a higher number."""
+    def outbox_pending(
+        self, limit: int = 1000, *, after: int = 0, feeder: str | None = None
+    ) -> list[AlarmEvent]:
+        """Return the unpublished events, oldest first, of one feeder or (None) of all.
+
+        `after` restricts to events with a higher number.
+        """
         query = sa.select(EVENT).join(OUTBOX, OUTBOX.c.seq == EVENT.c.seq).where(OUTBOX.c.seq > after)
+        if feeder is not None:
+            query = query.where(EVENT.c.feeder == feeder)
         query = query.order_by(EVENT.c.seq)
         with self._read() as connection:
             return [_event(row) for row in connection.execute(query.limit(limit)).mappings()]
