@@ -51,7 +51,7 @@ from service.metrics import Metrics
 from service.report.feeder_info import Ownership
 from service.report.report import BUSBAR, FeederReport
 from service.report.tick_state import TickState
-from service.store import AlarmEvent, Rejected, Store
+from service.store import Rejected, Store
 from service.store.committer import Committer, Executor, Publisher, Wish, alarm_key, incident_key, inline
 from service.store.schema import CommissioningEvent
 from service.store.state_codec import StateSnapshot
@@ -203,11 +203,9 @@ class RuntimeConfig:
 
 @dataclass(frozen=True, slots=True)
 class Handover:
-    """Everything that an owner of a feeder takes over from the one before."""
+    """What an owner of a feeder takes over from the one before."""
 
     state: PersistedState
-    events: tuple[AlarmEvent, ...]  # unpublished
-    incident_events: tuple[IncidentEvent, ...]  # unpublished
     open_incidents: tuple[IncidentEvent, ...]
 
 
@@ -377,7 +375,7 @@ class Engine:
     def adopt(
         self, sites: Sequence[Site], installed: Callable[[FeederMonitor], None]
     ) -> Future[list[FeederMonitor]]:
-        """Go on with feeders of another owner: their state, standing alarms and unpublished events.
+        """Go on with feeders of another owner: their state and standing alarms.
 
         `installed` is called with each monitor. Raises StoreUnavailable if the database cannot be read; no
         feeder is taken over then.
@@ -402,20 +400,17 @@ class Engine:
     def _handover(self, name: str, store: Store) -> Handover:
         return Handover(
             self._past(name, store),
-            tuple(store.outbox_pending(feeder=name)),
-            tuple(store.incidents_unpublished(feeder=name)),
             tuple(store.open_incident_events(feeder=name)),
         )
 
     def _take_over(self, handover: Handover) -> None:
-        """Set the replies for standing alarms and incidents, and publish what the earlier owner has not."""
+        """Set the replies for standing alarms and incidents."""
         publisher = self.committer.publisher
         if publisher is not None:
             for alarm in (one for one in handover.state.alarms if one.active):
                 publisher.answer(alarm_key(alarm), msgspec.json.encode(alarm_json(alarm)))
             for event in handover.open_incidents:
                 publisher.answer(incident_key(event.incident), msgspec.json.encode(event_json(event)))
-        self.committer.take_over(handover.events, handover.incident_events)
 
     def resign(self, names: Collection[str]) -> Future[None]:
         """End the monitoring of feeders for their next owner: their state is stored, their alarms stay.
@@ -443,13 +438,14 @@ class Engine:
         known = {name: known_of(monitor.site) for name, monitor in self.monitors.items()}
         self._wire = Wire(known, self.config.prefix, self.config.max_payload, self.config.meter_keys)
 
-    def begin(self) -> None:
+    def begin(self, given: Collection[str] = ()) -> None:
         """Set the replies for standing alarms; publish the stored alarms of an earlier process.
 
         Alarms of feeders that are neither monitored nor stored any more are cleared here: no monitor does it.
+        `given` are further feeders, which this process monitors later.
         """
-        ours, t = self.monitors.keys() | self.unloaded.keys() | self.store.feeders().keys(), self._wall()
-        standing = self.store.active()
+        ours, t = {*self.monitors, *self.unloaded, *self.store.feeders(), *given}, self._wall()
+        standing = [alarm for alarm in self.store.active() if self.store.mine(alarm.feeder)]
         left_out = [alarm for alarm in standing if alarm.feeder not in ours]
         self.committer.waiting.add(transitions=close(left_out, t, NOT_WATCHED))
         if self.committer.publisher is not None:
@@ -457,7 +453,7 @@ class Engine:
                 if alarm.feeder in ours:
                     self.committer.publisher.answer(alarm_key(alarm), msgspec.json.encode(alarm_json(alarm)))
             for event in self.store.open_incident_events():
-                if event.incident.feeder in ours:
+                if event.incident.feeder in ours and self.store.mine(event.incident.feeder):
                     payload = msgspec.json.encode(event_json(event))
                     self.committer.publisher.answer(incident_key(event.incident), payload)
         for name in self.unloaded:

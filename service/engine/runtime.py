@@ -64,7 +64,6 @@ class Runtime:
     unloaded: stored feeders that cannot be loaded and are not monitored, with the reason.
     wall: wall clock, Unix s.
     settled: called between two rounds after the last unfinished design.
-    shared: other processes monitor other feeders in this database; `adopt` adds those of this process.
     """
 
     def __init__(
@@ -77,9 +76,8 @@ class Runtime:
         unloaded: Mapping[str, str] | None = None,
         wall: Callable[[], float] = time.time,
         settled: Callable[[], None] = lambda: None,
-        shared: bool = False,
     ) -> None:
-        self._wall, self._settled, self._shared = wall, settled, shared
+        self._wall, self._settled = wall, settled
         self._stopping = False
         self._engine = Engine(
             config,
@@ -139,8 +137,7 @@ class Runtime:
         """
         self._loop = asyncio.get_running_loop()
         try:
-            if not self._shared:
-                await self._loop.run_in_executor(self._writer, self._engine.begin)
+            await self._loop.run_in_executor(self._writer, self._engine.begin, self._given)
             for monitor in self._engine.monitors.values():
                 self._design(monitor)
             while not self._stopping:

@@ -16,6 +16,7 @@ each meter.
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
@@ -34,7 +35,7 @@ from service.ingest.queues import BusCounts, StoredEvent, Value
 from service.metrics import Metrics
 from service.report.report import FeederReport
 from service.store import AlarmEvent, OutcomeUnknown, Rejected, Store, StoreUnavailable
-from service.store.schema import CommissioningEvent
+from service.store.schema import CommissioningEvent, LeaseLost
 from service.store.state_codec import SnapshotKind, StateSnapshot
 from service.store.store import Reader
 
@@ -149,10 +150,14 @@ class WriteQueue:
 
     def forget(self, feeder: str) -> None:
         """Drop all data of a feeder: its stored removal is its last change."""
-        self._transitions = [item for item in self._transitions if item.alarm.feeder != feeder]
-        self._reports = deque(item for item in self._reports if item.feeder != feeder)
-        self._kept = {key: item for key, item in self._kept.items() if item.feeder != feeder}
-        self._happened = deque(item for item in self._happened if item.feeder != feeder)
+        self.keep(lambda name: name != feeder)
+
+    def keep(self, wanted: Callable[[str], bool]) -> None:
+        """Drop the data of all other feeders."""
+        self._transitions = [item for item in self._transitions if wanted(item.alarm.feeder)]
+        self._reports = deque(item for item in self._reports if wanted(item.feeder))
+        self._kept = {key: item for key, item in self._kept.items() if wanted(item.feeder)}
+        self._happened = deque(item for item in self._happened if wanted(item.feeder))
 
     def _bound(self) -> None:
         self._drop_oldest(self._reports, "report")
@@ -283,6 +288,8 @@ class WriteResult:
     """Result of a job: event numbers of a stored one, values read, or the error."""
 
     numbers: tuple[int, ...] | None = None
+    # Unpublished events of feeders that this process has taken over from another one.
+    taken: tuple[tuple[AlarmEvent, ...], tuple[IncidentEvent, ...]] = ((), ())
     marked: bool = False
     page: tuple[AlarmEvent, ...] | None = None
     incidents: tuple[IncidentEvent, ...] = ()
@@ -403,6 +410,8 @@ class Committer:
         self._send(replace(self._job(), command=command))
 
     def _job(self) -> WriteJob:
+        # Of released and lost feeders, nothing is stored any more.
+        self.waiting.keep(self._store.mine)
         more = self._outbox_after is not None and len(self._unpublished) < OUTBOX_PAGE
         return WriteJob(
             next(self._keys),
@@ -422,18 +431,22 @@ class Committer:
 
     def _written(self, job: WriteJob, done: WriteResult) -> None:
         """Process the result of a job."""
-        self.storing = False
+        self.storing, lost = False, isinstance(done.error, LeaseLost)
+        self._take_over(job, done)
         if done.numbers is not None:
             self._unknown = None
             self.waiting.stored()
             self._kept(job.batch.reports)
             self._publish_stored(job.transitions, done.numbers)
-        elif isinstance(done.error, OutcomeUnknown) or job is self._unknown:
+        elif not lost and (isinstance(done.error, OutcomeUnknown) or job is self._unknown):
             self._unknown = job
         else:
+            self._unknown = None
             self.waiting.give_back(job.batch)
         self._note_publication(job, done)
-        if done.error is not None:
+        if lost:
+            _log.warning("leases are lost; the data of their feeders are dropped", problem=str(done.error))
+        elif done.error is not None:
             self._refused(done.error)
         elif self.problem is not None:
             _log.info("the database is back")
@@ -442,6 +455,14 @@ class Committer:
         self._publish_waiting()
         if job.command is not None:
             self._answer(job.command, done)
+
+    def _take_over(self, job: WriteJob, done: WriteResult) -> None:
+        """Queue the unpublished events of feeders that this process has taken over from another one."""
+        alarms, incidents = done.taken
+        # Later ones are read from the outbox in their order.
+        behind = math.inf if self._outbox_after is None else self._outbox_after
+        self._unpublished.extend((event.seq, event.alarm) for event in alarms if event.seq <= behind)
+        self._incidents.extend(event for event in incidents if event.seq <= job.incidents_after)
 
     def _note_publication(self, job: WriteJob, done: WriteResult) -> None:
         """Drop the marked events, and queue those that were read for publication."""
@@ -452,27 +473,14 @@ class Committer:
             for _ in job.incidents:
                 self._incidents_done.popleft()
         if done.incidents_after is not None:
-            self._queue_incidents(done.incidents)
+            self._incidents.extend(done.incidents)
             if done.incidents:
                 self._stored()
             self._incidents_after = done.incidents_after
         if done.page is not None:
-            self._queue_events(done.page)
+            self._unpublished.extend((event.seq, event.alarm) for event in done.page)
             full = len(done.page) == OUTBOX_PAGE
             self._outbox_after = done.page[-1].seq if full else None
-
-    def take_over(self, events: Iterable[AlarmEvent], incidents: Iterable[IncidentEvent]) -> None:
-        """Queue stored events that the earlier owner of their feeder has not published."""
-        self._queue_events(events)
-        self._queue_incidents(incidents)
-
-    def _queue_events(self, events: Iterable[AlarmEvent]) -> None:
-        known = {number for number, _ in self._unpublished} | set(self._published)
-        self._unpublished.extend((event.seq, event.alarm) for event in events if event.seq not in known)
-
-    def _queue_incidents(self, events: Iterable[IncidentEvent]) -> None:
-        known = {event.seq for event in self._incidents} | set(self._incidents_done)
-        self._incidents.extend(event for event in events if event.seq not in known)
 
     def _answer(self, command: Command, done: WriteResult) -> None:
         """Pass a command its result. Stored data stay stored, whatever failed afterwards."""
@@ -527,7 +535,7 @@ class Committer:
         if self._outbox_after is not None:
             return  # It is read from the outbox in its order.
         if len(self._unpublished) >= UNPUBLISHED_KEPT:
-            self._outbox_after = self._unpublished[-1][0]
+            self._outbox_after = max(queued for queued, _ in self._unpublished)
         else:
             self._unpublished.append((number, alarm))
 
@@ -535,7 +543,9 @@ class Committer:
         while self._unpublished:
             number, alarm = self._unpublished[0]
             done = partial(self._published.append, number)
-            if self.publisher is None:
+            if not self._store.mine(alarm.feeder):
+                pass  # Its worker publishes it.
+            elif self.publisher is None:
                 done()
             else:
                 payload = msgspec.json.encode(alarm_json(alarm))
@@ -546,7 +556,9 @@ class Committer:
         while self._incidents:
             event = self._incidents[0]
             done = partial(self._incidents_done.append, event.seq)
-            if self.publisher is None:
+            if not self._store.mine(event.incident.feeder):
+                pass
+            elif self.publisher is None:
                 done()
             else:
                 payload = msgspec.json.encode(event_json(event))
@@ -562,6 +574,9 @@ def _write(store: Store, job: WriteJob) -> WriteResult:
     try:
         if job.probe:
             store.check()
+        # Before the commit, which adds events.
+        alarms, events = store.take_over()
+        done = WriteResult(taken=(tuple(alarms), tuple(events)))
         batch, wish = job.batch, Wish() if job.command is None else job.command.wish
         numbers = store.commit(
             job.transitions,
@@ -575,7 +590,7 @@ def _write(store: Store, job: WriteJob) -> WriteResult:
             now=job.now,
             key=job.key,
         )
-        done = WriteResult(numbers)
+        done = replace(done, numbers=numbers)
         if job.command is not None:
             done = replace(done, found=job.command.read(store))
         store.outbox_done(job.published)

@@ -24,7 +24,7 @@ from psycopg.abc import PQGen
 from psycopg.waiting import Ready
 from sqlalchemy.dialects import postgresql, sqlite
 
-from service.store.schema import WRITER, OutcomeUnknown, StoreUnavailable, WriterLost
+from service.store.schema import SHARD, WORKER, WRITER, OutcomeUnknown, StoreUnavailable, WriterLost
 
 CALL_S = 5.0
 """Time limit of a call without any response of the server, s."""
@@ -36,6 +36,8 @@ LOCK_S = 12.0
 """Wait for the lock at the start, s; above `IDLE_S`, so that the session of a stopped writer ends first."""
 RELOCK_S = 3.0
 """Wait for the lock after a broken connection, s; below `CALL_S`."""
+HELD_S = 2.0
+"""Time without a call after which the server ends a transaction of a worker, and with it its locks, s."""
 OPEN_S = 60.0
 """Time limit of a call while the database is opened, s: a migration may take longer than a write."""
 ADVISORY_LOCK = 0x6772_6964_7365_6300
@@ -84,13 +86,32 @@ class Timed(psycopg.Connection[Any]):
             return result.value  # type: ignore[no-any-return]
 
 
+def share_database(made: Timed, name: str, wait_s: float) -> None:
+    """Hold the lock of the database together with other workers, for the rest of the session.
+
+    Raises StoreUnavailable if a service without workers holds it for longer than `wait_s`.
+    """
+    made.limit_s = wait_s + CALL_S
+    made.execute("SELECT set_config('lock_timeout', %s, false)", (f"{wait_s * 1e3:.0f}ms",))
+    try:
+        made.execute("SELECT pg_advisory_lock_shared(%s)", (ADVISORY_LOCK,))
+    except psycopg.errors.LockNotAvailable as error:
+        text = f"cannot open {name} for workers: a service without workers writes it; stop that service first"
+        raise StoreUnavailable(text, code="single-process") from error
+    made.execute("SELECT set_config('lock_timeout', %s, false)", (f"{RELOCK_S * 1e3:.0f}ms",))
+    made.commit()
+    made.limit_s = CALL_S
+
+
 class WriterSession:
     """Session of the writer.
 
+    name: address of the database, for messages.
     up: True while the session is open.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, name: str) -> None:
+        self.name = name
         self.up = False
         self._limit_s = OPEN_S
         self._connection: Timed | None = None
@@ -130,16 +151,36 @@ class WriterSession:
         wait = LOCK_S if self._server is None else RELOCK_S
         made.limit_s = wait + CALL_S
         made.execute("SELECT set_config('lock_timeout', %s, false)", (f"{wait * 1e3:.0f}ms",))
-        made.execute("SELECT pg_advisory_lock(%s)", (ADVISORY_LOCK,))
+        try:
+            made.execute("SELECT pg_advisory_lock(%s)", (ADVISORY_LOCK,))
+        except psycopg.errors.LockNotAvailable:
+            made.rollback()
+            self._refuse_workers(made)
+            raise
         made.execute("SELECT set_config('lock_timeout', %s, false)", (f"{RELOCK_S * 1e3:.0f}ms",))
         made.commit()
         self._server = server
+
+    def _refuse_workers(self, made: Timed) -> None:
+        """Raise StoreUnavailable if workers hold the lock: they share it."""
+        shared = made.execute("SELECT pg_try_advisory_lock_shared(%s)", (ADVISORY_LOCK,)).fetchone()
+        if shared is not None and shared[0]:
+            text = f"cannot open {self.name}: workers write it; stop all of them and the front first"
+            raise StoreUnavailable(text, code="workers-running")
 
     def note(self, error: sa.exc.DBAPIError) -> None:
         """Update the state of the session after a failed call."""
         if error.connection_invalidated:
             self.up = False
             self._ended = getattr(error.orig, "sqlstate", None) in _ENDED_BY_SERVER
+
+
+class WorkerSession(WriterSession):
+    """Session of a worker. Its end is no loss: the epochs of the leases decide about every transaction."""
+
+    def _take_lock(self, made: Timed) -> None:
+        share_database(made, self.name, LOCK_S if self._server is None else RELOCK_S)
+        self._server = ""
 
 
 def code_of(cause: BaseException) -> str:
@@ -156,10 +197,9 @@ def engines(url: sa.URL, session: WriterSession) -> tuple[sa.Engine, sa.Engine]:
     wait = {"connect_timeout": int(CALL_S), "tcp_user_timeout": int(CALL_S * 1e3)}
     # The server ends calls of disconnected clients; otherwise an abandoned call keeps its locks.
     gone = f"-c client_connection_check_interval={BEAT_S * 1e3:.0f}"
-    silent = " ".join(
-        f"-c {name}={IDLE_S * 1e3:.0f}"
-        for name in ("idle_session_timeout", "idle_in_transaction_session_timeout")
-    )
+    held_s = HELD_S if isinstance(session, WorkerSession) else IDLE_S
+    silent = f"-c idle_session_timeout={IDLE_S * 1e3:.0f} "
+    silent += f"-c idle_in_transaction_session_timeout={held_s * 1e3:.0f}"
     writer = sa.create_engine(
         url,
         pool_size=1,
@@ -209,6 +249,8 @@ class _FileMoved(OSError):
 class Connections:
     """The writer and the readers of a database.
 
+    worker: number of the worker that writes together with others; 0 for an observer that writes nothing; None
+        for one writer.
     name: address without the password.
     insert: INSERT of the dialect, with ON CONFLICT.
     lost: reason why nothing more may be written, or None.
@@ -216,7 +258,8 @@ class Connections:
     Raises StoreUnavailable if it cannot be opened, or another process writes it.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, *, worker: int | None = None) -> None:
+        self._worker = worker
         self._lock_file: IO[bytes] | None = None
         self._engines: tuple[sa.Engine, ...] = ()
         self._path: Path | None = None
@@ -274,9 +317,29 @@ class Connections:
             self._session.opened()
 
     def own(self, connection: sa.Connection) -> None:
-        """Register this store as the writer."""
-        connection.execute(WRITER.delete())
-        connection.execute(WRITER.insert().values(owner=self._owner, commits=0, checks=0))
+        """Register this store as the writer, or as one of the workers; end the rights of all others."""
+        w = WRITER.c
+        if self._worker is None:
+            connection.execute(WRITER.delete())
+            connection.execute(WORKER.delete())
+            claimed = SHARD.update().where(SHARD.c.owner.is_not(None))
+            connection.execute(claimed.values(owner=None, epoch=SHARD.c.epoch + 1))
+        else:
+            workers = sa.select(WORKER.c.number)
+            connection.execute(WRITER.delete().where(sa.or_(w.worker.is_(None), w.worker.not_in(workers))))
+        if self._worker != 0:
+            row = {"owner": self._owner, "commits": 0, "checks": 0, "worker": self._worker}
+            connection.execute(WRITER.insert().values(row))
+
+    def count_check(self, connection: sa.Connection) -> None:
+        """Write a counter."""
+        own = WRITER.update().where(WRITER.c.owner == self._owner)
+        connection.execute(own.values(checks=WRITER.c.checks + 1))
+
+    def stored_before(self, connection: sa.Connection, key: int) -> bool:
+        """True if the last commit had this key; the transaction sets it."""
+        other = WRITER.update().where(WRITER.c.owner == self._owner, WRITER.c.commits != key)
+        return connection.execute(other.values(commits=key)).rowcount == 0
 
     @property
     def beat_s(self) -> float | None:
@@ -288,8 +351,9 @@ class Connections:
 
     def beat(self) -> None:
         """Keep the session of the lock, or note its loss."""
+        check = self._check_owner if self._worker != 0 else lambda _: None
         if self._session is not None and self._session.up:
-            with self.write("keep the session of"):
+            with self._guard("keep the session of"), self._begin(check):
                 pass
 
     @contextmanager
@@ -349,7 +413,12 @@ class Connections:
         return not isinstance(error.orig, NoAnswer)
 
     def _check_owner(self, connection: sa.Connection) -> None:
-        if connection.scalar(sa.select(WRITER.c.owner)) != self._owner:
+        if self._worker == 0:
+            raise StoreUnavailable(
+                f"{self.name}: this process is no worker and writes nothing", code="read-only"
+            )
+        own = sa.select(WRITER.c.owner).where(WRITER.c.owner == self._owner)
+        if connection.scalar(own) is None:
             raise WriterLost("another process has opened it for writing since", code="other-writer")
 
     @contextmanager
@@ -442,7 +511,7 @@ class Connections:
 
     def _open_postgresql(self, url: sa.URL) -> tuple[sa.Engine, sa.Engine]:
 
-        self._session = WriterSession()
+        self._session = (WriterSession if self._worker is None else WorkerSession)(self.name)
         return engines(url, self._session)
 
 

@@ -68,18 +68,29 @@ class Said:
 # --- Write access: one transaction with the alarms ---
 
 
-def feeders_due(connection: sa.Connection, now: float) -> set[str]:
-    """Return the feeders with a shelf or a planned work that changes by `now`, Unix s."""
-    found: set[str] = set()
+Mine = Callable[[str], bool]
+"""True for the feeders that this process writes."""
+
+
+def _due(connection: sa.Connection, mine: Mine) -> dict[str, float]:
+    """Return the next time at which a shelf or a planned work of each feeder changes, Unix s."""
+    found: dict[str, float] = {}
     for table in (SHELF, WORK):
-        found |= set(connection.scalars(sa.select(table.c.feeder).where(table.c.t_next <= now)))
+        query = sa.select(table.c.feeder, sa.func.min(table.c.t_next)).where(table.c.t_next.is_not(None))
+        for feeder, t in connection.execute(query.group_by(table.c.feeder)):
+            if mine(feeder):
+                found[feeder] = min(t, found.get(feeder, t))
     return found
 
 
-def next_due(connection: sa.Connection) -> float | None:
+def feeders_due(connection: sa.Connection, now: float, mine: Mine) -> set[str]:
+    """Return the feeders with a shelf or a planned work that changes by `now`, Unix s."""
+    return {feeder for feeder, t in _due(connection, mine).items() if t <= now}
+
+
+def next_due(connection: sa.Connection, mine: Mine) -> float | None:
     """Return the next time at which a shelf or a planned work changes, Unix s; None without one."""
-    times = [connection.scalar(sa.select(sa.func.min(table.c.t_next))) for table in (SHELF, WORK)]
-    return min((float(t) for t in times if t is not None), default=None)
+    return min(_due(connection, mine).values(), default=None)
 
 
 def orphans(connection: sa.Connection) -> list[AlarmTransition]:
@@ -104,12 +115,14 @@ def prepare(
     transitions: Sequence[AlarmTransition],
     actions: Sequence[Action],
     now: float,
+    due: Iterable[str] = (),
 ) -> list[IncidentWrite]:
     """Return the changes of incidents by a commit; its alarms are not stored yet.
 
     now: wall clock, Unix s.
+    due: feeders with a shelf or a planned work that changes.
     """
-    alarms: dict[str, list[AlarmTransition]] = {name: [] for name in sorted(feeders_due(connection, now))}
+    alarms: dict[str, list[AlarmTransition]] = {name: [] for name in sorted(due)}
     asked: dict[str, list[Action]] = {}
     for transition in transitions:
         alarms.setdefault(transition.alarm.feeder, []).append(transition)
@@ -156,12 +169,11 @@ def store(connection: sa.Connection, insert: Any, writes: Iterable[IncidentWrite
     return newest
 
 
-def published(connection: sa.Connection, numbers: Iterable[int]) -> None:
+def published(connection: sa.Connection, numbers: Collection[int]) -> None:
     """Mark events as published on zenoh."""
-    rows = [{"number": number} for number in numbers]
-    if rows:
-        update = INCIDENT_EVENT.update().where(INCIDENT_EVENT.c.seq == sa.bindparam("number"))
-        connection.execute(update.values(published=True), rows)
+    for part in _parts(sorted(numbers)):
+        update = INCIDENT_EVENT.update().where(INCIDENT_EVENT.c.seq.in_(part))
+        connection.execute(update.values(published=True))
 
 
 def _book(
@@ -217,7 +229,7 @@ def _standing(connection: sa.Connection, table: sa.Table, kind: TypeAdapter[T], 
     return [kind.validate_json(data) for data in connection.scalars(query.order_by(table.c.id))]
 
 
-def _parts(values: Sequence[str]) -> Iterator[Sequence[str]]:
+def _parts(values: Sequence[T]) -> Iterator[Sequence[T]]:
     for start in range(0, len(values), AT_ONCE):
         yield values[start : start + AT_ONCE]
 
@@ -408,17 +420,10 @@ class IncidentReader:
             rows = connection.execute(sa.select(INCIDENT_EVENT).where(e.seq.in_(newest)).order_by(e.seq))
             return [_event(row) for row in rows.mappings()]
 
-    def incidents_unpublished(
-        self, *, after: int = 0, limit: int = 1000, feeder: str | None = None
-    ) -> list[IncidentEvent]:
-        """Return the events of incidents that are not published on zenoh, oldest first.
-
-        `feeder` None: of all feeders.
-        """
+    def incidents_unpublished(self, *, after: int = 0, limit: int = 1000) -> list[IncidentEvent]:
+        """Return the events of incidents that are not published on zenoh, oldest first."""
         e = INCIDENT_EVENT.c
         query = sa.select(INCIDENT_EVENT).where(e.published.is_(False), e.seq > after)
-        if feeder is not None:
-            query = query.where(e.feeder == feeder)
         with self._read() as connection:
             return [_event(row) for row in connection.execute(query.order_by(e.seq).limit(limit)).mappings()]
 

@@ -27,7 +27,7 @@ import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql
 
 from service.store import connect
-from service.store.connect import ADVISORY_LOCK, CALL_S, RELOCK_S, NoAnswer, Timed, code_of
+from service.store.connect import CALL_S, HELD_S, RELOCK_S, NoAnswer, Timed, code_of, share_database
 from service.store.schema import SHARD, WORKER, LeaseLost, StoreUnavailable, migrate
 
 SHARDS: Final = 256
@@ -42,8 +42,6 @@ GRACE_S: Final = 0.5
 """Absence after which the shards of a worker are free, s; above `POLL_S`, within which it reconnects."""
 SETTLE_S: Final = 2.0
 """Wait for further workers, s, while no live worker has a shard: all workers start at once."""
-HELD_S: Final = 2.0
-"""Time after which the server ends a transaction of a stopped process, s."""
 WORKER_LOCKS: Final = 0x6773_776B
 """Class of the workers' advisory locks."""
 _CLAIM_LOCK: Final = 0x6772_6964_636C_6D00
@@ -122,7 +120,10 @@ class Leases:
         self.worker = worker
         self._weights = [1] * SHARDS
         self._lock = threading.RLock()
+        # Replaced as a whole under `_change`, and read without it.
         self._held: dict[int, Lease] = {}
+        self._lost: set[Lease] = set()
+        self._change = threading.Lock()
         self._number: int | None = None
         self._renewed = float("-inf")
         # Beginning of each absence in this process's monotonic time, s, within one session.
@@ -151,7 +152,7 @@ class Leases:
     def close(self) -> None:
         """Release all shards, deregister and close the session; idempotent."""
         with self._lock:
-            self._held = {}
+            self._drop(set(self._held.values()))
             number, self._number = self._number, None
             try:
                 if number is not None:
@@ -210,8 +211,13 @@ class Leases:
     # ---------------------------------------------------------------- leases
 
     @property
+    def number(self) -> int:
+        """Number of this worker; 0 of an observer."""
+        return self._number or 0
+
+    @property
     def held(self) -> Mapping[int, Lease]:
-        """Leases of this process by shard, as of the last call; without a call to the database."""
+        """Leases of this process by shard, as of the last call; another object after each change."""
         return self._held
 
     @property
@@ -234,7 +240,9 @@ class Leases:
                 _serialise(connection)
                 plan = self._plan(_view(connection))
                 new = _claim(connection, self._number, plan.mine)
-            self._held = {**self._held, **{lease.shard: lease for lease in new}}
+            if new:
+                with self._change:
+                    self._held = {**self._held, **{lease.shard: lease for lease in new}}
             return new
 
     def renew(self) -> set[Lease]:
@@ -243,7 +251,7 @@ class Leases:
         All leases are lost after the registration was deleted by a service without workers.
         """
         with self._lock:
-            began, number = time.monotonic(), self._number
+            began, number = time.monotonic(), self.number
             with self._transaction() as connection:
                 renewed = connection.execute(
                     WORKER.update().where(WORKER.c.number == number).values(until=_NOW + EXPIRY_S)
@@ -252,12 +260,13 @@ class Leases:
                 found = {Lease(*row) for row in connection.execute(owned)} if renewed else set()
                 # The outcome of a claim or a release may have been unknown.
                 strays = found - set(self._held.values())
-                if strays and number is not None:
+                if strays:
                     _release(connection, number, [lease.shard for lease in strays])
             if renewed:
                 self._renewed = began
-            lost = set(self._held.values()) - found
-            self._held = {shard: lease for shard, lease in self._held.items() if lease not in lost}
+            self._drop(set(self._held.values()) - found, lost=True)
+            with self._change:
+                lost, self._lost = self._lost, set()
             return lost
 
     def excess(self) -> list[int]:
@@ -291,7 +300,7 @@ class Leases:
         """Release shards for other workers. From the call on, this worker writes none of their feeders."""
         with self._lock:
             gone = set(shards) & set(self._held)
-            self._held = {shard: lease for shard, lease in self._held.items() if shard not in gone}
+            self._drop({self._held[shard] for shard in gone})
             if gone and self._number is not None:
                 with self._transaction() as connection:
                     _release(connection, self._number, gone)
@@ -301,17 +310,30 @@ class Leases:
 
         Raises LeaseLost if this worker does not hold all of them in the database.
         """
-        held = self._held
-        shards = sorted({shard_of(feeder) for feeder in feeders})
-        if not shards:
-            return
-        query = sa.select(SHARD.c.shard, SHARD.c.epoch).where(
-            SHARD.c.shard.in_(shards), SHARD.c.owner == self._number
-        )
-        found = {Lease(*row) for row in connection.execute(query.with_for_update(read=True))}
-        lost = [feeder for feeder in feeders if held.get(shard_of(feeder)) not in found]
+        lost = set(feeders) - self.among(connection, feeders)
         if lost:
             raise LeaseLost(self.worker, lost)
+
+    def among(self, connection: sa.Connection, feeders: Collection[str]) -> set[str]:
+        """Return those of some feeders that `check` accepts, and lock their shards."""
+        held, shards = self._held, sorted({shard_of(feeder) for feeder in feeders})
+        query = sa.select(SHARD.c.shard, SHARD.c.epoch).where(
+            SHARD.c.shard.in_(shards), SHARD.c.owner == self.number
+        )
+        rows = connection.execute(query.with_for_update(read=True)) if shards else ()
+        found = {Lease(*row) for row in rows}
+        self._drop({held[shard] for shard in shards if shard in held} - found, lost=True)
+        return {feeder for feeder in feeders if held.get(shard_of(feeder)) in found}
+
+    def _drop(self, leases: Collection[Lease], *, lost: bool = False) -> None:
+        """Hold leases no more; `renew` returns the lost ones."""
+        with self._change:
+            gone = set(leases) & set(self._held.values())
+            if not gone:
+                return
+            self._held = {shard: lease for shard, lease in self._held.items() if lease not in gone}
+            if lost:
+                self._lost |= gone
 
     # ------------------------------------------------------------ distribution
 
@@ -376,23 +398,6 @@ class Leases:
                 raise
             return self._engine.connect()
         return connection
-
-
-def share_database(made: Timed, name: str, wait_s: float) -> None:
-    """Hold the lock of the database together with other workers, for the rest of the session.
-
-    Raises StoreUnavailable if a service without workers holds it for longer than `wait_s`.
-    """
-    made.limit_s = wait_s + CALL_S
-    made.execute("SELECT set_config('lock_timeout', %s, false)", (f"{wait_s * 1e3:.0f}ms",))
-    try:
-        made.execute("SELECT pg_advisory_lock_shared(%s)", (ADVISORY_LOCK,))
-    except psycopg.errors.LockNotAvailable as error:
-        text = f"cannot open {name} for workers: a service without workers writes it; stop that service first"
-        raise StoreUnavailable(text, code="single-process") from error
-    made.execute("SELECT set_config('lock_timeout', %s, false)", (f"{RELOCK_S * 1e3:.0f}ms",))
-    made.commit()
-    made.limit_s = CALL_S
 
 
 def _engine(database: str, connected: Any) -> tuple[sa.Engine, str]:

@@ -139,13 +139,19 @@ def add_rollups(
     rolled[feeder] = end
 
 
-def prune_rollups(
-    connection: sa.Connection, feeder: str, t: float, *, apart_from: Collection[str] | None, limit: int
-) -> None:
-    """Delete old roll-ups of a feeder and, unless `apart_from` is None, of all feeders that are not in it."""
+def feeders_in(connection: sa.Connection, table: sa.Table) -> list[str]:
+    """Return the feeders of a table with the feeder first in its key, by one look-up for each of them."""
+    name = table.c.feeder
+    found = sa.select(sa.func.min(name).label("name")).cte(recursive=True)
+    following = sa.select(sa.func.min(name)).where(name > found.c.name).scalar_subquery()
+    found = found.union_all(sa.select(following).where(found.c.name.is_not(None)))
+    return list(connection.scalars(sa.select(found.c.name).where(found.c.name.is_not(None))))
+
+
+def prune_rollups(connection: sa.Connection, feeders: Collection[str], t: float, *, limit: int) -> None:
+    """Delete old roll-ups of some feeders."""
     r = ROLLUP.c
-    others = [] if apart_from is None else [r.feeder.not_in(apart_from)]
-    oldest = sa.select(r.feeder, r.t).where(sa.or_(r.feeder == feeder, *others), r.t < t - ROLLUP_S)
+    oldest = sa.select(r.feeder, r.t).where(r.feeder.in_(feeders), r.t < t - ROLLUP_S)
     connection.execute(ROLLUP.delete().where(sa.tuple_(r.feeder, r.t).in_(oldest.limit(limit))))
 
 

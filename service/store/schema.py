@@ -224,6 +224,15 @@ FEEDER = sa.Table(
     META,
     sa.Column("name", sa.String(64), primary_key=True),
     sa.Column("tables", sa.Text, nullable=False),
+    sa.Column(
+        "version", sa.BigInteger, nullable=False, server_default="0"
+    ),  # `FEEDER_CHANGES` after its change
+)
+FEEDER_CHANGES = sa.Table(
+    "feeder_changes",
+    META,
+    # One row: number of feeders that were added, changed or removed over REST.
+    sa.Column("number", sa.BigInteger, nullable=False),
 )
 
 
@@ -259,8 +268,9 @@ WRITER = sa.Table(
     sa.Column("owner", sa.String(32), nullable=False),
     sa.Column("commits", sa.BigInteger, nullable=False),
     sa.Column("checks", sa.BigInteger, nullable=False),
+    sa.Column("worker", SEQ),  # its number in `worker`; null: the only writer
 )
-"""One row. A store with a replaced `owner` writes nothing more."""
+"""One row, or one for each worker. A store without its row writes nothing more."""
 WORKER = sa.Table(
     "worker",
     META,
@@ -325,7 +335,9 @@ def _add_digest(connection: sa.Connection) -> None:
 
 
 def _add_writer(connection: sa.Connection) -> None:
-    WRITER.create(connection)
+    connection.exec_driver_sql(
+        "CREATE TABLE writer (owner VARCHAR(32) NOT NULL, commits BIGINT NOT NULL, checks BIGINT NOT NULL)"
+    )
 
 
 def _add_incidents(connection: sa.Connection) -> None:
@@ -340,8 +352,11 @@ def _add_incidents(connection: sa.Connection) -> None:
 
 
 def _add_workers(connection: sa.Connection) -> None:
-    for table in (WORKER, SHARD):
+    connection.exec_driver_sql("ALTER TABLE writer ADD COLUMN worker BIGINT")
+    connection.exec_driver_sql("ALTER TABLE feeder ADD COLUMN version BIGINT NOT NULL DEFAULT 0")
+    for table in (WORKER, SHARD, FEEDER_CHANGES):
         table.create(connection)
+    connection.execute(FEEDER_CHANGES.insert().values(number=0))
 
 
 MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
@@ -368,6 +383,7 @@ def migrate(connection: sa.Connection, name: str) -> None:
     if not sa.inspect(connection).has_table(VERSION.name):
         META.create_all(connection)
         connection.execute(VERSION.insert().values(version=newest))
+        connection.execute(FEEDER_CHANGES.insert().values(number=0))
         return
     version = int(connection.execute(sa.select(VERSION.c.version)).scalar_one())
     if version > newest:

@@ -11,22 +11,30 @@ from __future__ import annotations
 import json
 import math
 import threading
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import sqlalchemy as sa
 import structlog
 
 from gridsec.interface import Cause, Decision
-from service.alarms.incidents import Action, Shelf
+from service.alarms.incidents import Action, IncidentEvent, Shelf
 from service.alarms.state_machine import Alarm, AlarmState, AlarmTransition, Change, from_json, to_json
 from service.report.report import FeederReport
 from service.store import incidents
 from service.store.connect import Connections
 from service.store.incidents import IncidentReader, rank_of, sorted_by, words_in
-from service.store.rollups import AlarmSpan, add_rollups, prune_rollups, read_alarm_spans, read_series
+from service.store.leases import Lease, Leases, shard_of
+from service.store.rollups import (
+    AlarmSpan,
+    add_rollups,
+    feeders_in,
+    prune_rollups,
+    read_alarm_spans,
+    read_series,
+)
 from service.store.schema import (
     ALARM,
     BAD,
@@ -35,11 +43,12 @@ from service.store.schema import (
     DISTRUST,
     EVENT,
     FEEDER,
+    FEEDER_CHANGES,
     HISTORY,
     INCIDENT_EVENT,
     LAYOUT,
     OUTBOX,
-    WRITER,
+    ROLLUP,
     AlarmEvent,
     CommissioningChange,
     CommissioningEvent,
@@ -52,6 +61,8 @@ from service.store.schema import (
 )
 from service.store.series import Series, pack, rows, unpack
 from service.store.state_codec import SnapshotKind, StateSnapshot
+
+T = TypeVar("T", bound="AlarmEvent | IncidentEvent")
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,16 +193,9 @@ class Reader(IncidentReader):
         with self._read() as connection:
             return [_event(row) for row in connection.execute(query).mappings()]
 
-    def outbox_pending(
-        self, limit: int = 1000, *, after: int = 0, feeder: str | None = None
-    ) -> list[AlarmEvent]:
-        """Return the unpublished events, oldest first, of one feeder or (None) of all.
-
-        `after` restricts to events with a higher number.
-        """
+    def outbox_pending(self, limit: int = 1000, *, after: int = 0) -> list[AlarmEvent]:
+        """Return the unpublished events, oldest first. `after` restricts to events with a higher number."""
         query = sa.select(EVENT).join(OUTBOX, OUTBOX.c.seq == EVENT.c.seq).where(OUTBOX.c.seq > after)
-        if feeder is not None:
-            query = query.where(EVENT.c.feeder == feeder)
         query = query.order_by(EVENT.c.seq)
         with self._read() as connection:
             return [_event(row) for row in connection.execute(query.limit(limit)).mappings()]
@@ -278,6 +282,17 @@ class Reader(IncidentReader):
             rows = connection.execute(sa.select(FEEDER.c.name, FEEDER.c.tables).order_by(FEEDER.c.name))
             return {name: json.loads(tables) for name, tables in rows}
 
+    def feeder_changes(self) -> int:
+        """Number of changes of the feeders added over REST: it differs after each one, in any process."""
+        with self._read() as connection:
+            return int(connection.scalar(sa.select(FEEDER_CHANGES.c.number)) or 0)
+
+    def feeder_versions(self) -> dict[str, int]:
+        """Number of the last change of each feeder added over REST, by name."""
+        with self._read() as connection:
+            rows = connection.execute(sa.select(FEEDER.c.name, FEEDER.c.version).order_by(FEEDER.c.name))
+            return {row.name: row.version for row in rows}
+
     def commission(self, feeder: str) -> StateSnapshot | None:
         """Return the stored commissioning of a feeder, or None."""
         return self._kept(COMMISSION, feeder, SnapshotKind.COMMISSION)
@@ -354,12 +369,19 @@ class Store(Reader):
 
     url: `sqlite:///file`, `sqlite:////absolute/file` or `postgresql+psycopg://user@host/name`.
     history: grid and duration of the history.
+    leases: leases of this process, which writes the feeders of its shards beside other workers; before
+        `Leases.register` it writes nothing. None: this process is the only writer.
     Raises StoreUnavailable if the database cannot be opened and written, if another process writes it, or if
         it is newer than this program.
     """
 
-    def __init__(self, url: str, *, history: HistoryRules | None = None) -> None:
-        super().__init__(Connections(url))
+    def __init__(
+        self, url: str, *, history: HistoryRules | None = None, leases: Leases | None = None
+    ) -> None:
+        super().__init__(Connections(url, worker=None if leases is None else leases.number))
+        self._leases = leases
+        # Leases at the last change of `_due` and of the caches, and at the last take-over.
+        self._known = self._taken = self._held
         self._history_rules = history or HistoryRules()
         self.history_step_s = self._history_rules.step_s
         self._lock = threading.RLock()
@@ -376,10 +398,11 @@ class Store(Reader):
                 if standing:
                     now = max(item.t for item in standing)
                     found = incidents.prepare(connection, standing, (), now)
+                    self._number_events(connection)
                     incidents.store(connection, self._connections.insert, found)
                 newest = connection.scalar(sa.select(sa.func.max(EVENT.c.seq)))
                 newest_incident = connection.scalar(sa.select(sa.func.max(INCIDENT_EVENT.c.seq)))
-                self._due = incidents.next_due(connection)
+                self._due = incidents.next_due(connection, self.mine)
         except BaseException:
             self._connections.close()
             raise
@@ -440,9 +463,62 @@ class Store(Reader):
         """Number of the newest event of an incident; without a call to the database."""
         return self._last_incident_event
 
+    @property
+    def _held(self) -> Mapping[int, Lease]:
+        return {} if self._leases is None else self._leases.held
+
+    def mine(self, feeder: str) -> bool:
+        """True if this process writes a feeder; without a call to the database."""
+        return self._leases is None or self._leases.lease_of(feeder) is not None
+
     def due(self, now: float) -> bool:
-        """True if a shelf or a planned work changes by `now`, Unix s; without a call to the database."""
-        return self._due is not None and self._due <= now
+        """True if a commit is due by `now`, Unix s, without other reason; without a call to the database.
+
+        A shelf or a planned work changes, or the leases have changed.
+        """
+        moved = self._leases is not None and self._leases.held is not self._known
+        return moved or (self._due is not None and self._due <= now)
+
+    def refresh(self) -> None:
+        """Read `last_event` and `last_incident_event`: other processes add events, too."""
+        with self._read() as connection:
+            newest = connection.scalar(sa.select(sa.func.max(EVENT.c.seq)))
+            newest_incident = connection.scalar(sa.select(sa.func.max(INCIDENT_EVENT.c.seq)))
+        self._last_event = max(self._last_event, newest or 0)
+        self._last_incident_event = max(self._last_incident_event, newest_incident or 0)
+
+    def outbox_pending(self, limit: int = 1000, *, after: int = 0) -> list[AlarmEvent]:
+        """Return the unpublished events of the feeders of this process, as `Reader.outbox_pending`."""
+        read = super().outbox_pending
+        return _selected(
+            lambda limit, after: read(limit, after=after),
+            lambda item: self.mine(item.alarm.feeder),
+            limit,
+            after,
+        )
+
+    def incidents_unpublished(self, *, after: int = 0, limit: int = 1000) -> list[IncidentEvent]:
+        """Return the unpublished events of incidents of the feeders of this process, oldest first."""
+        read = super().incidents_unpublished
+        return _selected(
+            lambda limit, after: read(after=after, limit=limit),
+            lambda item: self.mine(item.incident.feeder),
+            limit,
+            after,
+        )
+
+    def take_over(self) -> tuple[list[AlarmEvent], list[IncidentEvent]]:
+        """Return the unpublished events of the shards that were claimed since the last call."""
+        held = self._held
+        new = {shard for shard, lease in held.items() if self._taken.get(shard) != lease}
+        if not new:
+            self._taken = held
+            return [], []
+        self.refresh()
+        alarms = [item for item in self.outbox_pending(_ALL) if shard_of(item.alarm.feeder) in new]
+        events = self.incidents_unpublished(limit=_ALL)
+        self._taken = held
+        return alarms, [item for item in events if shard_of(item.incident.feeder) in new]
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
@@ -461,6 +537,28 @@ class Store(Reader):
     def _write(self) -> Iterator[sa.Connection]:
         with self._alone(), self._connections.write() as connection:
             yield connection
+
+    def _check(self, connection: sa.Connection, feeders: Collection[str]) -> None:
+        if self._leases is not None:
+            self._leases.check(connection, feeders)
+
+    def _number_events(self, connection: sa.Connection) -> None:
+        """Let no other worker number events until the end of the transaction.
+
+        Otherwise a reader could see a number before a lower one of a transaction in progress, and miss
+        the lower one.
+        """
+        if self._leases is not None:
+            connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_EVENT_LOCK)))
+
+    def _adopt(self) -> None:
+        """Forget the feeders of released and lost shards: other workers continue their history."""
+        held = self._held
+        if held is not self._known:
+            for cache in (self._marks, self._rolled, self._since_prune):
+                for feeder in [name for name in cache if not self.mine(name)]:
+                    cache.pop(feeder)
+            self._known = held
 
     def commit(
         self,
@@ -498,23 +596,24 @@ class Store(Reader):
         if now is None:
             now = max((item.t for item in transitions), default=-math.inf)
         with self._alone():
+            grouped = bool(transitions or actions or self.due(now))
+            self._adopt()
             marks, rolled = dict(self._marks), dict(self._rolled)
             worthy = [report for report in reports if self._worth(marks, report)]
-            grouped = bool(transitions or actions or self.due(now))
             if not (grouped or worthy or rejected or kept or happened or without or put):
                 return ()
+            feeders = {item.alarm.feeder for item in transitions} | {item.feeder for item in actions}
+            feeders |= {item.feeder for item in worthy} | {item.feeder for item in kept}
+            feeders |= {item.feeder for item in happened}
+            feeders |= {name for name in (without, put and put[0]) if name is not None}
             newest, following = self._last_incident_event, self._due
             with self._connections.write() as connection:
-                if key is not None and _stored_before(connection, key):
-                    newer = sa.select(EVENT.c.seq).where(EVENT.c.seq > self._last_event)
-                    numbers = tuple(connection.scalars(newer.order_by(EVENT.c.seq)))
+                if key is not None and self._connections.stored_before(connection, key):
+                    numbers = self._numbers_of(connection, transitions)
                 else:
-                    grouping = incidents.prepare(connection, transitions, actions, now) if grouped else []
-                    numbers = tuple(self._put_transition(connection, item) for item in transitions)
-                    incidents.store(connection, self._connections.insert, grouping)
-                    for report in worthy:
-                        self._put_history(connection, report)
-                        add_rollups(connection, self._connections.insert, rolled, report)
+                    due = incidents.feeders_due(connection, now, self.mine) if grouped else set[str]()
+                    self._check(connection, feeders | due)
+                    self._put_history(connection, worthy, rolled)
                     if rejected:
                         _put_rejected(connection, rejected)
                     for item in kept:
@@ -525,31 +624,69 @@ class Store(Reader):
                         _forget_feeder(connection, without)
                     if put is not None:
                         self._put_feeder(connection, *put)
+                    # Last: other workers wait for the numbers.
+                    numbers = self._put_events(connection, transitions, actions, now, due)
                 if grouped:
                     newest = connection.scalar(sa.select(sa.func.max(INCIDENT_EVENT.c.seq))) or 0
-                    following = incidents.next_due(connection)
+                    following = incidents.next_due(connection, self.mine)
             self._marks, self._rolled, self._due = marks, rolled, following
             self._last_incident_event = newest
             self._last_event = max((self._last_event, *numbers))
             return numbers
 
-    def outbox_done(self, numbers: Iterable[int]) -> None:
-        """Delete the outbox entries of published events."""
-        rows = [{"number": number} for number in numbers]
-        if rows:
-            with self._write() as connection:
-                connection.execute(OUTBOX.delete().where(OUTBOX.c.seq == sa.bindparam("number")), rows)
-
-    def incidents_published(self, numbers: Sequence[int]) -> None:
-        """Mark events of incidents as published on zenoh."""
+    def outbox_done(self, numbers: Collection[int]) -> None:
+        """Delete the outbox entries of published events; those of other workers stay."""
         if numbers:
             with self._write() as connection:
-                incidents.published(connection, numbers)
+                own = self._own_events(connection, EVENT, numbers)
+                connection.execute(OUTBOX.delete().where(OUTBOX.c.seq.in_(own)))
+
+    def incidents_published(self, numbers: Collection[int]) -> None:
+        """Mark events of incidents as published on zenoh; those of other workers stay."""
+        if numbers:
+            with self._write() as connection:
+                incidents.published(connection, self._own_events(connection, INCIDENT_EVENT, numbers))
+
+    def _own_events(
+        self, connection: sa.Connection, table: sa.Table, numbers: Collection[int]
+    ) -> Collection[int]:
+        """Return those of some events that belong to feeders of this process."""
+        if self._leases is None:
+            return numbers
+        c = table.c
+        found = connection.execute(sa.select(c.seq, c.feeder).where(c.seq.in_(numbers))).all()
+        own = self._leases.among(connection, {feeder for _, feeder in found})
+        return [number for number, feeder in found if feeder in own]
 
     def check(self) -> None:
         """Test a write. Raises StoreUnavailable if the database cannot be written."""
         with self._write() as connection:
-            connection.execute(WRITER.update().values(checks=WRITER.c.checks + 1))
+            self._connections.count_check(connection)
+
+    def _numbers_of(
+        self, connection: sa.Connection, transitions: Sequence[AlarmTransition]
+    ) -> tuple[int, ...]:
+        """Return the numbers of the events of a commit that was stored before."""
+        e, feeders = EVENT.c, {item.alarm.feeder for item in transitions}
+        newer = sa.select(e.seq).where(e.seq > self._last_event, e.feeder.in_(feeders)).order_by(e.seq)
+        return tuple(connection.scalars(newer.limit(len(transitions))))
+
+    def _put_events(
+        self,
+        connection: sa.Connection,
+        transitions: Sequence[AlarmTransition],
+        actions: Sequence[Action],
+        now: float,
+        due: Collection[str],
+    ) -> tuple[int, ...]:
+        """Store transitions and the changes of their incidents; return the numbers of the events."""
+        if not (transitions or actions or due):
+            return ()
+        grouping = incidents.prepare(connection, transitions, actions, now, due)
+        self._number_events(connection)
+        numbers = tuple(self._put_transition(connection, item) for item in transitions)
+        incidents.store(connection, self._connections.insert, grouping)
+        return numbers
 
     def _put_transition(self, connection: sa.Connection, transition: AlarmTransition) -> int:
         alarm = transition.alarm
@@ -583,7 +720,8 @@ class Store(Reader):
         return number
 
     def _put_feeder(self, connection: sa.Connection, name: str, tables: Mapping[str, Any]) -> None:
-        row = {"name": name, "tables": json.dumps(tables, allow_nan=False)}
+        version = _count_change(connection)
+        row = {"name": name, "tables": json.dumps(tables, allow_nan=False), "version": version}
         statement = self._connections.insert(FEEDER).values(row)
         connection.execute(statement.on_conflict_do_update(index_elements=["name"], set_=row))
 
@@ -600,18 +738,23 @@ class Store(Reader):
             marks[report.feeder] = now
         return worth
 
-    def _put_history(self, connection: sa.Connection, report: FeederReport) -> None:
-        row = {
-            "feeder": report.feeder,
-            "t": report.t,
-            "verdict": str(report.verdict),
-            "cause": str(report.cause),
-            "layout": self._layout(connection, report),
-            "data": pack(rows(report)),
-        }
-        statement = self._connections.insert(HISTORY).values(row)
-        connection.execute(statement.on_conflict_do_update(index_elements=["feeder", "t"], set_=row))
-        self._prune(connection, report)
+    def _put_history(
+        self, connection: sa.Connection, reports: Sequence[FeederReport], rolled: dict[str, float]
+    ) -> None:
+        layouts = self._layouts(connection, reports)
+        for report in reports:
+            row = {
+                "feeder": report.feeder,
+                "t": report.t,
+                "verdict": str(report.verdict),
+                "cause": str(report.cause),
+                "layout": layouts[_meters(report)],
+                "data": pack(rows(report)),
+            }
+            statement = self._connections.insert(HISTORY).values(row)
+            connection.execute(statement.on_conflict_do_update(index_elements=["feeder", "t"], set_=row))
+            self._prune(connection, report)
+            add_rollups(connection, self._connections.insert, rolled, report)
 
     def _prune(self, connection: sa.Connection, report: FeederReport) -> None:
         """Delete old history, with the first row after a start and then every `_PRUNE_EVERY` rows."""
@@ -624,32 +767,63 @@ class Store(Reader):
         lately = h.t.between(report.t - 2.0 * steady, report.t - steady)
         if count or not connection.scalar(sa.select(sa.exists().where(h.feeder == report.feeder, lately))):
             return
-        whose = h.feeder == report.feeder
-        if before is not None:
+
+        def pruned(table: sa.Table) -> list[str]:
             # Feeders without reports since start-up are pruned by this feeder's clock.
-            whose |= h.feeder.not_in([*self._marks, report.feeder])
+            others = [] if before is None else feeders_in(connection, table)
+            silent = [name for name in others if name not in self._marks and self.mine(name)]
+            return [report.feeder, *silent]
+
         # The number of rows fits the time limit of a call.
-        oldest = sa.select(h.feeder, h.t).where(whose, h.t < report.t - keep).limit(_PRUNED_AT_ONCE)
-        connection.execute(HISTORY.delete().where(sa.tuple_(h.feeder, h.t).in_(oldest)))
-        others = None if before is None else (*self._marks, report.feeder)
-        prune_rollups(connection, report.feeder, report.t - keep, apart_from=others, limit=_PRUNED_AT_ONCE)
+        oldest = sa.select(h.feeder, h.t).where(h.feeder.in_(pruned(HISTORY)), h.t < report.t - keep)
+        connection.execute(
+            HISTORY.delete().where(sa.tuple_(h.feeder, h.t).in_(oldest.limit(_PRUNED_AT_ONCE)))
+        )
+        prune_rollups(connection, pruned(ROLLUP), report.t - keep, limit=_PRUNED_AT_ONCE)
 
-    def _layout(self, connection: sa.Connection, report: FeederReport) -> int:
-        meters = json.dumps([meter.meter for meter in rows(report)])
-        row = {"meters": meters, "digest": digest(meters)}
-        known = connection.scalar(sa.select(LAYOUT.c.id).where(LAYOUT.c.digest == row["digest"]))
-        if known is None:
-            known = connection.execute(LAYOUT.insert().values(row).returning(LAYOUT.c.id)).scalar_one()
-        return int(known)
+    def _layouts(self, connection: sa.Connection, reports: Sequence[FeederReport]) -> dict[str, int]:
+        """Return the ids of the layouts of reports, by their meters; new ones are stored."""
+        digests = {digest(meters): meters for meters in map(_meters, reports)}
+        known = sa.select(LAYOUT.c.digest, LAYOUT.c.id).where(LAYOUT.c.digest.in_(digests))
+        found = {row.digest: row.id for row in connection.execute(known)}
+        # In one order: two workers that add the same layouts wait for each other only once.
+        new = [{"meters": digests[key], "digest": key} for key in sorted(digests.keys() - found.keys())]
+        if new:
+            connection.execute(self._connections.insert(LAYOUT).on_conflict_do_nothing(), new)
+            found = {row.digest: row.id for row in connection.execute(known)}
+        return {meters: int(found[key]) for key, meters in digests.items()}
 
 
-def _stored_before(connection: sa.Connection, key: int) -> bool:
-    """True if the last commit had this key; the transaction sets it."""
-    changed = connection.execute(WRITER.update().values(commits=key).where(WRITER.c.commits != key))
-    return changed.rowcount == 0
+_ALL = 1_000_000
+"""Limit of a read of all unpublished events."""
+_EVENT_LOCK = 0x6772_6964_6576_7400
+
+
+def _selected(
+    read: Callable[[int, int], list[T]], wanted: Callable[[T], bool], limit: int, after: int
+) -> list[T]:
+    """Read pages until `limit` wanted events are found."""
+    found: list[T] = []
+    while True:
+        page = read(limit, after)
+        found += [item for item in page if wanted(item)]
+        if len(page) < limit or len(found) >= limit:
+            return found[:limit]
+        after = page[-1].seq
+
+
+def _meters(report: FeederReport) -> str:
+    return json.dumps([meter.meter for meter in rows(report)])
+
+
+def _count_change(connection: sa.Connection) -> int:
+    """Return the number of this change of the feeders added over REST."""
+    count = FEEDER_CHANGES.update().values(number=FEEDER_CHANGES.c.number + 1)
+    return int(connection.execute(count.returning(FEEDER_CHANGES.c.number)).scalar_one())
 
 
 def _forget_feeder(connection: sa.Connection, name: str) -> None:
+    _count_change(connection)
     connection.execute(FEEDER.delete().where(FEEDER.c.name == name))
     for table in _KEPT.values():
         connection.execute(table.delete().where(table.c.feeder == name))

@@ -69,7 +69,7 @@ from service.settings import refuse_exposed, settings
 from service.store import Store, backup, committer, leases, schema
 from service.store.access import AccessStore
 from service.store.committer import Batch
-from service.store.connect import NoAnswer, WriterSession
+from service.store.connect import NoAnswer, WriterSession, share_database
 from service.store.state_codec import decode, decode_distrust, encode, encode_distrust, fingerprint
 from tests.service.stored import T0, an_alarm, raised
 
@@ -278,10 +278,15 @@ def not_a_database(place: Path, _: Patch) -> None:
 
 
 def session_ended(_: Path, __: Patch) -> None:
-    lost = WriterSession()
+    lost = WriterSession("postgresql://server/g")
     lost._ended, lost._server = True, "noon"
     made = SimpleNamespace(execute=lambda _: SimpleNamespace(fetchone=lambda: ("noon",)))
     lost._take_lock(cast(Any, made))
+
+
+def workers_running(_: Path, __: Patch) -> None:
+    made = SimpleNamespace(execute=lambda *_: SimpleNamespace(fetchone=lambda: (True,)))
+    WriterSession("postgresql://server/g")._refuse_workers(cast(Any, made))
 
 
 def single_process(_: Path, __: Patch) -> None:
@@ -289,7 +294,7 @@ def single_process(_: Path, __: Patch) -> None:
         if "pg_advisory_lock_shared" in statement:
             raise psycopg.errors.LockNotAvailable("canceling statement due to lock timeout")
 
-    leases.share_database(cast(Any, SimpleNamespace(execute=execute)), "postgresql://server/g", 0.0)
+    share_database(cast(Any, SimpleNamespace(execute=execute)), "postgresql://server/g", 0.0)
 
 
 def defect(_: Path, __: Patch) -> None:
@@ -638,6 +643,7 @@ CALLS: dict[str, Call] = {
     "second writer": with_store(another_writer),
     "session that the server ends": session_ended,
     "workers beside a service without workers": single_process,
+    "service without workers beside workers": workers_running,
     "workers with SQLite": lambda _, __: leases.Leases("sqlite:///g.db", "a"),
     "second worker of a name": lambda _, __: leases._View({1: "a"}, frozenset({1}), 0.0, {}).refuse(
         "a", "postgresql://server/g"

@@ -382,7 +382,7 @@ def test_a_service_without_workers_excludes_workers(url: str, monkeypatch: pytes
     monkeypatch.setattr(connect, "LOCK_S", 0.2)
     with Store(url), refused(StoreUnavailable, "single-process"):
         Leases(url, "a")
-    with Leases(url, "a"), refused(StoreUnavailable, "database-locked"):
+    with Leases(url, "a"), refused(StoreUnavailable, "workers-running"):
         Store(url)
     Store(url).close()
 

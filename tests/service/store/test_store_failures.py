@@ -184,8 +184,11 @@ OLD_LAYOUT = sa.Table(
 def put_back_incidents(connection: sa.Connection) -> None:
     """Make a database one of version 5."""
     incidents = (schema.INCIDENT_EVENT, schema.INCIDENT, schema.SHELF, schema.WORK)
-    for table in (schema.WORKER, schema.SHARD, schema.ROLLUP, *incidents):
+    workers = (schema.WORKER, schema.SHARD, schema.FEEDER_CHANGES)
+    for table in (*workers, schema.ROLLUP, *incidents):
         table.drop(connection)
+    connection.exec_driver_sql("ALTER TABLE writer DROP COLUMN worker")
+    connection.exec_driver_sql("ALTER TABLE feeder DROP COLUMN version")
     connection.exec_driver_sql("DROP INDEX alarm_by_incident")
     for column in ("incident", "work", "words"):
         connection.exec_driver_sql(f"ALTER TABLE alarm DROP COLUMN {column}")
@@ -320,7 +323,7 @@ def test_a_failed_migration_leaves_the_database_as_it_was(
     with Store(url) as store:
         store.commit(put=("village", {}))
     with sqlite3.connect(tmp_path / "m.db") as raw:
-        assert [row[1] for row in raw.execute("PRAGMA table_info(feeder)")] == ["name", "tables"]
+        assert "note" not in [row[1] for row in raw.execute("PRAGMA table_info(feeder)")]
     raw.close()
 
 
