@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -17,6 +17,7 @@ import structlog
 from feeders.format.tables import from_json
 from feeders.model.site import Site, from_tables
 from gridsec.errors import FeederInvalid, GridsecError
+from service.store.store import Reader
 
 AHEAD_MOST: Final = 500
 """Largest number of feeders that are loaded ahead of time."""
@@ -63,11 +64,12 @@ def load(listed: Listed) -> Site | str:
 class Catalogue:
     """Feeders of the database. Thread-safe.
 
-    read: returns the tables of all feeders by name.
+    store: database.
     """
 
-    def __init__(self, read: Callable[[], Mapping[str, Mapping[str, Any]]]) -> None:
-        self._read = read
+    def __init__(self, store: Reader) -> None:
+        self._store = store
+        self._change: int | None = None
         self._lock = threading.Lock()
         self._feeders: dict[str, Listed] = {}
         self._sites: dict[str, tuple[str, Site | str]] = {}
@@ -78,8 +80,13 @@ class Catalogue:
         return self._feeders
 
     def refresh(self) -> Changes:
-        """Read the feeders; return what has changed. Raises StoreUnavailable."""
-        found = {name: Listed(name, tables, _digest(tables)) for name, tables in sorted(self._read().items())}
+        """Read the feeders after a change; return what has changed. Raises StoreUnavailable."""
+        change = self._store.feeder_changes()
+        if change == self._change:
+            return Changes()
+        read = self._store.feeders()
+        found = {name: Listed(name, tables, _digest(tables)) for name, tables in read.items()}
+        self._change = change
         with self._lock:
             before, self._feeders = self._feeders, found
             self._sites = {name: kept for name, kept in self._sites.items() if name in found}

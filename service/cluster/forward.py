@@ -196,15 +196,16 @@ class Forwarder:
 
     def _by_owner(self, names: Sequence[str]) -> dict[str, list[str]]:
         """Alarms by a feeder of each owner. Raises AlarmUnknown, NoOwner."""
-        parts: dict[str, tuple[str, list[str]]] = {}
+        feeders: dict[str, str] = {}
         for name in names:
-            alarm = self._store.alarm(name)
-            if alarm is None:
+            if (alarm := self._store.alarm(name)) is None:
                 raise AlarmUnknown(name)
-            owner = self._workers.owner(alarm.feeder)
-            if owner is None:
-                raise NoOwner(alarm.feeder)
-            parts.setdefault(owner[0].worker, (alarm.feeder, []))[1].append(name)
+            feeders[name] = alarm.feeder
+        parts: dict[str, tuple[str, list[str]]] = {}
+        for name, feeder in feeders.items():
+            if (owner := self._workers.owner(feeder)) is None:
+                raise NoOwner(feeder)
+            parts.setdefault(owner[0].worker, (feeder, []))[1].append(name)
         return dict(parts.values())
 
 

@@ -7,6 +7,7 @@ a feeder without an owner is in them as undecided, cause `no-owner`. Requests fo
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import time
 from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
@@ -34,9 +35,10 @@ from service.errors import FeederUnknown, NoOwner
 from service.metrics import Metrics
 from service.report.feeder_info import Ownership
 from service.report.report import FeederReport
-from service.store import StoreUnavailable
-from service.store.follow import FollowingStore
+from service.store import Store, StoreUnavailable
 
+POLL_S: Final = 0.2
+"""Interval of the reads of the newest event, s."""
 REFRESH_S: Final = 1.0
 """Interval of the reads of the feeders in the database, s."""
 METRICS_S: Final = 5.0
@@ -51,7 +53,7 @@ _log = structlog.get_logger("gridsec.cluster")
 class Front:
     """Backend of the API over workers.
 
-    store: reader of the database.
+    store: database, which the front observes.
     workers: the heard workers.
     catalogue: feeders of the database.
     given: feeders of the command line.
@@ -62,7 +64,7 @@ class Front:
 
     def __init__(
         self,
-        store: FollowingStore,
+        store: Store,
         workers: Workers,
         catalogue: Catalogue,
         given: Mapping[str, Site],
@@ -71,7 +73,7 @@ class Front:
         shelve_most_s: float,
         wall: Callable[[], float] = time.time,
     ) -> None:
-        self.store: Any = store
+        self.store = store
         self.shelve_most_s = shelve_most_s
         self._workers, self._catalogue = workers, catalogue
         self._way: Forwarder | None = None
@@ -80,6 +82,7 @@ class Front:
         self._missing = set(given)
         self._problem: str | None = None
         self._registered: list[str] = []
+        self._read = asyncio.Event()
         self._subscribers: set[asyncio.Queue[str]] = set()
         self._stopping = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -101,7 +104,10 @@ class Front:
     async def run(self) -> None:
         """Follow the database, and put the feeders of the command line, until `stop`."""
         self._loop = asyncio.get_running_loop()
-        putting = asyncio.create_task(self._put_given(), name="given feeders")
+        side = [
+            asyncio.create_task(self._put_given(), name="given feeders"),
+            asyncio.create_task(self._follow(), name="new events"),
+        ]
         try:
             while not self._stopping.is_set():
                 await self.refresh()
@@ -110,8 +116,19 @@ class Front:
                 except TimeoutError:
                     continue
         finally:
-            putting.cancel()
-            await asyncio.gather(putting, return_exceptions=True)
+            for task in side:
+                task.cancel()
+            await asyncio.gather(*side, return_exceptions=True)
+
+    async def _follow(self) -> None:
+        """Read the numbers of the newest events, and wake streams after a change."""
+        while True:
+            before = (self.store.last_event, self.store.last_incident_event)
+            with contextlib.suppress(StoreUnavailable):  # `refresh` reports it
+                await asyncio.to_thread(self.store.refresh)
+            if before != (self.store.last_event, self.store.last_incident_event):
+                self._notify("alarm")
+            await asyncio.sleep(POLL_S)
 
     async def refresh(self) -> None:
         """Read the feeders of the database."""
@@ -122,11 +139,13 @@ class Front:
             self._problem = f"database: {error}"
             return
         self._problem = None
+        self._read.set()
         if changes.added or changes.removed:
             self._notify("state")
 
     async def _put_given(self) -> None:
         """Put the feeders of the command line into the database, through the owners of their shards."""
+        await self._read.wait()
         for name, site in self._given.items():
             tables = json.loads(json.dumps(to_json(site.tables)))
             while True:
@@ -159,15 +178,8 @@ class Front:
 
     def heard(self) -> None:
         """Wake streams after a message of a worker; called from any thread."""
-        self._in_loop("state")
-
-    def stored(self) -> None:
-        """Wake streams after a new event in the database; called from any thread."""
-        self._in_loop("alarm")
-
-    def _in_loop(self, kind: str) -> None:
         if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._notify, kind)
+            self._loop.call_soon_threadsafe(self._notify, "state")
 
     def _notify(self, kind: str) -> None:
         for queue in self._subscribers:
@@ -235,10 +247,11 @@ class Front:
 
     def feeder(self, name: str) -> dict[str, Any] | None:
         """Return the meters of a feeder as in its layout, or None."""
-        listed = self._catalogue.feeders.get(name)
-        if listed is None:
+        listed, site = self._catalogue.feeders.get(name), self._given.get(name)
+        if listed is None and site is None:
             return None
-        return {"name": name, "layout": {"customers": [{"meter": meter} for meter in listed.meters]}}
+        meters = listed.meters if listed is not None else () if site is None else site.meter_ids
+        return {"name": name, "layout": {"customers": [{"meter": meter} for meter in meters]}}
 
     def known(self, name: str) -> bool:
         """True if a feeder exists and its tables can be loaded."""

@@ -23,9 +23,9 @@ from service.cluster.workers import Workers
 from service.ingest.align import Clock
 from service.ingest.zenoh_bus import Bus
 from service.settings import ENV_PREFIX, Settings, SettingsInvalid
+from service.store import Store
 from service.store.cluster_secret import cluster_secret
 from service.store.committer import missed
-from service.store.follow import FollowingStore
 from service.store.leases import Leases
 
 OBSERVER: Final = "front"
@@ -50,14 +50,13 @@ def check_cluster(settings: Settings) -> None:
 
 async def serve_front(
     settings: Settings,
-    count: int,
     *,
     announce: Callable[[Running], None] = lambda _: None,
     signals: bool = True,
     stopping: Callable[[], None] = lambda: None,
     wall: Callable[[], float] = time.time,
 ) -> None:
-    """Run a front with `count` local workers until SIGINT, SIGTERM or `Running.stop`.
+    """Run a front with `Settings.workers` local workers until SIGINT, SIGTERM or `Running.stop`.
 
     Raises SettingsInvalid, FeederInvalid, StoreUnavailable, BusUnavailable, AddressUnavailable if it cannot
     start.
@@ -72,19 +71,19 @@ async def serve_front(
     with ExitStack() as stack:
         leases = stack.enter_context(Leases(settings.database, OBSERVER))
         envelope = Envelope(cluster_secret(settings.database), wall)
-        store = stack.enter_context(FollowingStore(settings.database))
+        store = stack.enter_context(Store(settings.database, leases=leases))
         http = HttpSide.open(stack, settings, shares, targets, wall)
         workers = Workers(envelope)
         front = Front(
             store,
             workers,
-            Catalogue(store.feeders),
+            Catalogue(store),
             sites,
             live_workers=leases.live_workers,
             shelve_most_s=3600.0 * settings.max_shelve_h,
             wall=wall,
         )
-        store.changed, workers.changed = front.stored, front.heard
+        workers.changed = front.heard
         bus = stack.enter_context(
             Bus(
                 bus_config(settings, shares),
@@ -109,7 +108,7 @@ async def serve_front(
         )
         front.attach(forwarder)
         bus.hear(STATES, workers.take)
-        async with _supervised(settings, count):
+        async with _supervised(settings):
             await http.serve(
                 stack,
                 front,
@@ -122,9 +121,9 @@ async def serve_front(
 
 
 @asynccontextmanager
-async def _supervised(settings: Settings, count: int) -> AsyncIterator[None]:
+async def _supervised(settings: Settings) -> AsyncIterator[None]:
     """Keep local workers running until the block ends."""
-    supervisor = Supervisor(count, worker_environment(settings))
+    supervisor = Supervisor(settings.workers or 0, worker_environment(settings))
     task = asyncio.create_task(supervisor.run(), name="workers")
     try:
         yield

@@ -203,7 +203,7 @@ class RuntimeConfig:
 
 @dataclass(frozen=True, slots=True)
 class Handover:
-    """What an owner of a feeder takes over from the one before."""
+    """State of a feeder for its next owner, as stored."""
 
     state: PersistedState
     open_incidents: tuple[IncidentEvent, ...]

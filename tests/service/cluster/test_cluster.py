@@ -1,0 +1,121 @@
+"""A front and workers as processes, over PostgreSQL and zenoh: fail-over after a kill, a freeze and more."""
+
+from __future__ import annotations
+
+import random
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import psycopg
+import pytest
+
+from feeders.model.site import Site, load
+from service.cli.console import LEASE_LOST
+from tests.service.clusters import LIE_VOLT, ServedCluster, served_cluster
+from tests.service.databases import Cluster
+from tests.service.failovers import Fault, Trial
+from tests.service.running import until
+
+pytestmark = pytest.mark.postgresql
+
+KILLED_S = 3.0
+"""Time limit from a kill of a worker until its feeders are judged, s."""
+FROZEN_S = 15.0
+"""Time limit from a freeze of a worker until its feeders are judged, s."""
+
+
+@pytest.fixture(scope="module")
+def site() -> Site:
+    return load("cigre-lv")
+
+
+def shared(live: ServedCluster) -> None:
+    """Wait until both workers have feeders, and every one is decided."""
+    until(lambda: set(live.owners().values()) == {"w0", "w1"}, "the distribution")
+    live.judged_within(live.names, time.time() - 1.0)
+
+
+def attack(live: ServedCluster, feeder: str) -> dict[str, Any]:
+    """Manipulate a meter; the alarm that is raised."""
+    meter = live.site.meter_ids[0]
+    live.fleet.lies[feeder, meter] = LIE_VOLT
+    until(lambda: live.alarms(state="raised", feeder=feeder), "the alarm")
+    (alarm,) = live.alarms(feeder=feeder)
+    assert (alarm["kind"], alarm["meter"]) == ("meter-manipulated", meter)
+    return alarm
+
+
+def acknowledge(live: ServedCluster, alarm: dict[str, Any]) -> None:
+    answer = live.http.post(f"/api/v1/alarms/{alarm['id']}/ack", json={"who": "Ada", "comment": "seen"})
+    assert (answer.status_code, answer.json()["acknowledged_by"]) == (200, "Ada")
+
+
+def suspects(state: dict[str, Any]) -> list[str]:
+    return [meter["meter"] for meter in state["meters"] if meter["suspect"]]
+
+
+def changes(live: ServedCluster, alarm: dict[str, Any]) -> list[str]:
+    return [one["change"] for one in live.get(f"/alarms/{alarm['id']}/events")["events"]]
+
+
+def test_a_killed_workers_feeders_are_judged_again(cluster: Cluster, tmp_path: Path, site: Site) -> None:
+    with served_cluster(tmp_path, cluster.database(), site, 2, 2, here=True) as live:
+        alarm = attack(live, "copy-0")
+        acknowledge(live, alarm)
+        before = live.state("copy-0")
+        victim = before["owner"]
+        gone = live.owned(victim)
+        killed = time.time()
+        live.workers[victim].send(signal.SIGKILL)
+        assert live.judging_within(gone, killed) < KILLED_S
+        after = live.state("copy-0")
+        assert (after["verdict"], suspects(after)) == ("attacked", suspects(before))
+        assert after["owner"] != victim
+        assert after["epoch"] > before["epoch"]
+        assert [one["id"] for one in live.alarms()] == [alarm["id"]]
+        assert changes(live, alarm) == ["raised", "acknowledged"]
+
+
+@pytest.mark.acceptance
+def test_a_frozen_worker_writes_nothing_more_and_ends(cluster: Cluster, tmp_path: Path, site: Site) -> None:
+    database = cluster.database()
+    with served_cluster(tmp_path, database, site, 4, 2) as live:
+        shared(live)
+        alarm = attack(live, "copy-0")
+        victim = live.state("copy-0")["owner"]
+        gone = live.owned(victim)
+        frozen = time.time()
+        live.workers[victim].send(signal.SIGSTOP)
+        # Its feeders are undecided, never clean, as soon as the front misses it.
+        until(lambda: live.listed()["copy-0"]["status"] == "undecided", "the front's notice", 6.0)
+        assert live.judging_within(gone, frozen) < FROZEN_S
+        written = rows(database)
+        live.workers[victim].send(signal.SIGCONT)
+        assert live.workers[victim].popen.wait(timeout=10.0) == LEASE_LOST
+        late = [row for row in rows(database) - written if row[2] < frozen]
+        assert late == []
+        assert [one["id"] for one in live.alarms()] == [alarm["id"]]
+        assert changes(live, alarm) == ["raised"]
+
+
+def rows(database: str) -> set[tuple[str, str, float]]:
+    """Feeder, content and time of all events and kept ticks."""
+    with psycopg.connect(database.replace("+psycopg", "")) as connection:
+        events = connection.execute("SELECT feeder, change, t FROM event").fetchall()
+        kept = connection.execute("SELECT feeder, verdict, t FROM history").fetchall()
+    return set(events) | set(kept)
+
+
+@pytest.mark.acceptance
+@pytest.mark.timeout(900)
+def test_no_fault_loses_or_doubles_an_alarm(cluster: Cluster, tmp_path: Path, site: Site) -> None:
+    with served_cluster(tmp_path, cluster.database(), site, 6, 3) as live:
+        trial = Trial(live, cluster, random.Random(1))
+        trial.begin()
+        faults = [Fault.KILL, Fault.FREEZE, Fault.TERMINATE, Fault.ROUTER]
+        for fault in (*faults, *trial.rng.sample(faults, 4), Fault.OUTAGE):
+            lasted = trial.strike(fault)
+            assert lasted < {Fault.KILL: KILLED_S}.get(fault, FROZEN_S), fault
+            assert trial.violations == []
