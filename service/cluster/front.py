@@ -166,7 +166,7 @@ class Front:
             )
         except (NoOwner, StoreUnavailable):
             return False
-        if answer.status != 200:
+        if 400 <= answer.status < 500:
             detail = json.loads(answer.body or b"{}").get("detail")
             _log.error("a feeder of the command line is refused", feeder=name, problem=detail)
         return answer.status == 200

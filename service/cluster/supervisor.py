@@ -9,7 +9,7 @@ import asyncio
 import os
 import signal
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import structlog
@@ -24,6 +24,8 @@ STEADY_S: Final = 60.0
 """Time after which a worker counts as started, s."""
 END_S: Final = 2.0
 """Time from SIGTERM to SIGKILL, s; the front ends within 3 s."""
+WORKER: Final = (sys.executable, "-c", "from service.cli.main import main; main()", "worker", "--until-eof")
+"""Command line of a local worker."""
 _log = structlog.get_logger("gridsec.cluster")
 _PASSED: Final = (
     "prefix",
@@ -68,10 +70,11 @@ class Supervisor:
 
     count: number of workers.
     environment: their environment.
+    command: their command line.
     """
 
-    def __init__(self, count: int, environment: Mapping[str, str]) -> None:
-        self._count, self._environment = count, dict(environment)
+    def __init__(self, count: int, environment: Mapping[str, str], command: Sequence[str] = WORKER) -> None:
+        self._count, self._environment, self._command = count, dict(environment), tuple(command)
         self._running: dict[int, asyncio.subprocess.Process] = {}
         self._ending = asyncio.Event()
 
@@ -105,15 +108,8 @@ class Supervisor:
             wait_s = min(2.0 * wait_s, AGAIN_MOST_S)
 
     async def _start(self) -> asyncio.subprocess.Process:
-        program = "from service.cli.main import main; main()"
         return await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-c",
-            program,
-            "worker",
-            "--until-eof",
-            stdin=asyncio.subprocess.PIPE,
-            env=self._environment,
+            *self._command, stdin=asyncio.subprocess.PIPE, env=self._environment
         )
 
     async def _end(self) -> None:

@@ -262,9 +262,16 @@ class ServedCluster:
 
 @contextmanager
 def served_cluster(
-    folder: Path, database: str, site: Site, feeders: int, workers: int, *, here: bool = False
+    folder: Path,
+    database: str,
+    site: Site,
+    feeders: int,
+    workers: int,
+    *,
+    here: bool = False,
+    options: tuple[str, ...] = (),
 ) -> Iterator[ServedCluster]:
-    """A front, with `here` in this process, and workers w0, w1, ...; ended with the block."""
+    """A front (with `here` in this process) and workers w0, w1, ...; ended with the block."""
     made = ServedCluster(folder, database, site, feeders)
     try:
         for k in range(workers):
@@ -272,7 +279,7 @@ def served_cluster(
         if here:
             made.start_front_here()
         else:
-            made.start_front()
+            made.start_front(*options)
         made.fleet.start()
         yield made
     finally:

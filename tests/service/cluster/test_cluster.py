@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import signal
 import time
@@ -13,7 +14,7 @@ import pytest
 
 from feeders.model.site import Site, load
 from service.cli.console import LEASE_LOST
-from tests.service.clusters import LIE_VOLT, ServedCluster, served_cluster
+from tests.service.clusters import LIE_VOLT, Process, ServedCluster, served_cluster
 from tests.service.databases import Cluster
 from tests.service.failovers import Fault, Trial
 from tests.service.running import until
@@ -119,3 +120,25 @@ def test_no_fault_loses_or_doubles_an_alarm(cluster: Cluster, tmp_path: Path, si
             lasted = trial.strike(fault)
             assert lasted < {Fault.KILL: KILLED_S}.get(fault, FROZEN_S), fault
             assert trial.violations == []
+
+
+@pytest.mark.acceptance
+def test_a_front_with_workers_of_its_own(cluster: Cluster, tmp_path: Path, site: Site) -> None:
+    with served_cluster(tmp_path, cluster.database(), site, 3, 0, options=("--workers", "2")) as live:
+        until(lambda: live.http.get("/readyz").status_code == 200, "readiness")
+        alarm = attack(live, "copy-0")
+        until(lambda: len(set(live.owners().values())) == 2, "the distribution")
+        front = live.front
+        assert isinstance(front, Process)
+        listed = Path(f"/proc/{front.pid}/task/{front.pid}/children").read_text()
+        children = [int(pid) for pid in listed.split()]
+        assert len(children) == 2
+        os.kill(children[0], signal.SIGKILL)
+        live.judging_within(live.names, time.time())
+        assert changes(live, alarm) == ["raised"]
+        # Metrics of all workers, with the worker as a label.
+        lines = live.http.get("/metrics").text.splitlines()
+        assert all('worker="' in line for line in lines if line.startswith("gridsec_ticks_total{"))
+        live.fleet.ended.set()
+        assert front.end() == 0
+        assert [pid for pid in children if Path(f"/proc/{pid}").exists()] == []
