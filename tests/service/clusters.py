@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import psycopg
 
 from feeders.format.tables import write
 from feeders.model.site import Site
@@ -192,6 +193,7 @@ class ServedCluster:
         made = self.workers[name] = Process(
             self.folder / f"{name}.log",
             *("worker", "--name", name, "--zenoh-connect", self.zenoh, "--database", self.database),
+            PGAPPNAME=name,
         )
         return made
 
@@ -258,6 +260,36 @@ class ServedCluster:
 
         until(done, f"ticks of {sorted(left)}", patience_s)
         return time.time() - since
+
+
+class Writes:
+    """Record of all changes of a database, by triggers: worker and time of each."""
+
+    TABLES = ("alarm", "event", "outbox", "history", "incident", "incident_event", "commission", "distrust")
+
+    def __init__(self, database: str) -> None:
+        self.address = database.replace("+psycopg", "")
+        with psycopg.connect(self.address, autocommit=True) as connection:
+            connection.execute("CREATE TABLE writes (worker text, t double precision)")
+            connection.execute(
+                "CREATE FUNCTION note() RETURNS trigger LANGUAGE plpgsql AS $$ BEGIN "
+                "INSERT INTO writes VALUES "
+                "(current_setting('application_name'), extract(epoch FROM clock_timestamp())); "
+                "RETURN NULL; END $$"
+            )
+            for table in self.TABLES:
+                connection.execute(
+                    f"CREATE TRIGGER note AFTER INSERT OR UPDATE OR DELETE ON {table} "
+                    "FOR EACH ROW EXECUTE FUNCTION note()"
+                )
+
+    def of(self, worker: str, since: float) -> int:
+        """Number of committed changes by a worker since a time."""
+        with psycopg.connect(self.address) as connection:
+            query = "SELECT count(*) FROM writes WHERE worker = %s AND t > %s"
+            row = connection.execute(query, (worker, since)).fetchone()
+        assert row is not None
+        return int(row[0])
 
 
 @contextmanager

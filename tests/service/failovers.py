@@ -17,7 +17,7 @@ import httpx
 import psycopg
 
 from service.cli.console import LEASE_LOST
-from tests.service.clusters import JUDGING, LIE_VOLT, Process, ServedCluster
+from tests.service.clusters import JUDGING, LIE_VOLT, Process, ServedCluster, Writes
 from tests.service.databases import Cluster
 from tests.service.running import until
 
@@ -51,6 +51,9 @@ class Trial:
     seconds: dict[Fault, list[float]] = field(default_factory=dict)
     decided: dict[Fault, list[float]] = field(default_factory=dict)
     violations: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.writes = Writes(self.live.database)
 
     def begin(self) -> None:
         """Wait until every feeder is judged, and manipulate a meter in every second one."""
@@ -97,10 +100,11 @@ class Trial:
         began = time.time()
         self.live.workers[name].send(signal.SIGSTOP)
         lasted = self.judged(feeders, began)
+        continued = time.time()
         self.live.workers[name].send(signal.SIGCONT)
-        code = self.live.workers[name].popen.wait(timeout=20.0)
-        if code != LEASE_LOST:
-            self.violations.append(f"freeze: exit code {code}")
+        code, written = self.live.workers[name].popen.wait(timeout=20.0), self.writes.of(name, continued)
+        if (code, written) != (LEASE_LOST, 0):
+            self.violations.append(f"freeze: exit code {code}, {written} writes afterwards")
         return lasted
 
     def router(self) -> tuple[float, float]:

@@ -9,12 +9,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-import psycopg
 import pytest
 
 from feeders.model.site import Site, load
 from service.cli.console import LEASE_LOST
-from tests.service.clusters import LIE_VOLT, Process, ServedCluster, served_cluster
+from tests.service.clusters import LIE_VOLT, Process, ServedCluster, Writes, served_cluster
 from tests.service.databases import Cluster
 from tests.service.failovers import Fault, Trial
 from tests.service.running import until
@@ -83,6 +82,7 @@ def test_a_killed_workers_feeders_are_judged_again(cluster: Cluster, tmp_path: P
 def test_a_frozen_worker_writes_nothing_more_and_ends(cluster: Cluster, tmp_path: Path, site: Site) -> None:
     database = cluster.database()
     with served_cluster(tmp_path, database, site, 4, 2) as live:
+        writes = Writes(database)
         shared(live)
         alarm = attack(live, "copy-0")
         victim = live.state("copy-0")["owner"]
@@ -92,21 +92,13 @@ def test_a_frozen_worker_writes_nothing_more_and_ends(cluster: Cluster, tmp_path
         # Its feeders are undecided, never clean, as soon as the front misses it.
         until(lambda: live.listed()["copy-0"]["status"] == "undecided", "the front's notice", 6.0)
         assert live.judging_within(gone, frozen) < FROZEN_S
-        written = rows(database)
+        assert writes.of(victim, 0.0) > 0
+        continued = time.time()
         live.workers[victim].send(signal.SIGCONT)
         assert live.workers[victim].popen.wait(timeout=10.0) == LEASE_LOST
-        late = [row for row in rows(database) - written if row[2] < frozen]
-        assert late == []
+        assert writes.of(victim, continued) == 0
         assert [one["id"] for one in live.alarms()] == [alarm["id"]]
         assert changes(live, alarm) == ["raised"]
-
-
-def rows(database: str) -> set[tuple[str, str, float]]:
-    """Feeder, content and time of all events and kept ticks."""
-    with psycopg.connect(database.replace("+psycopg", "")) as connection:
-        events = connection.execute("SELECT feeder, change, t FROM event").fetchall()
-        kept = connection.execute("SELECT feeder, verdict, t FROM history").fetchall()
-    return set(events) | set(kept)
 
 
 @pytest.mark.acceptance
