@@ -89,7 +89,7 @@ async function show(name, query = new URLSearchParams()) {
   if (turn !== page.turn) return; // The response belongs to an earlier choice.
   if (found instanceof Error) {
     if (found.status === 401) await session.begin();
-    else if (found.answered) refused(name, found.message);
+    else if (found.answered) refused(name, found.message, found.code === "no-owner" ? "UNDECIDED" : "NOT MONITORED");
     else page.linked = false;
     page.retry = setTimeout(() => show(name, query), 3000);
     return;
@@ -115,8 +115,8 @@ async function show(name, query = new URLSearchParams()) {
 }
 
 // The service responds with the reason why this feeder is not monitored.
-function refused(name, why) {
-  Object.assign(page, { feeder: null, report: null, heard: null, past: new Map(), refused: why, linked: true });
+function refused(name, why, as) {
+  Object.assign(page, { feeder: null, report: null, heard: null, past: new Map(), refused: why, refusedAs: as, linked: true });
   fleet.select(name);
   series.watch(null);
   address(name);
@@ -182,7 +182,7 @@ function verdict() {
   byId("busbar-meter").textContent = report?.busbar?.suspect ? busbarWords(report.busbar) : "";
   if (!report) {
     banner.empty(page.refused ?? "Waiting for the first tick.");
-    title(page.refused ? "NOT MONITORED" : "NO DATA");
+    title(page.refused ? page.refusedAs : "NO DATA");
     return;
   }
   const several = diagram.level === null;

@@ -83,7 +83,7 @@ export function nominals(feeder) {
 export async function getJson(url) {
   const response = await fetch(url, { headers: { Accept: "application/json" } });
   const body = await response.json().catch(() => ({}));
-  if (!response.ok) throw Object.assign(new Error(body.detail || `${response.status} ${response.statusText}`), { answered: true, status: response.status });
+  if (!response.ok) throw Object.assign(new Error(body.detail || `${response.status} ${response.statusText}`), { answered: true, status: response.status, code: body.code });
   return body;
 }
 

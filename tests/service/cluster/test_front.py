@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import Browser, expect
 
 from feeders.model.site import load
 from service.cluster.run import check_cluster
@@ -93,6 +95,18 @@ def test_alarms_come_from_the_database(live: ServedCluster) -> None:
 def test_feeders_of_the_command_line_are_fixed(live: ServedCluster) -> None:
     is_problem(live.http.delete("/api/v1/feeders/copy-0"), 409)
     is_problem(live.http.delete("/api/v1/feeders/nowhere"), 503)
+
+
+@pytest.mark.postgresql
+@pytest.mark.browser
+def test_the_page_shows_it_as_undecided(live: ServedCluster, browser: Browser) -> None:
+    page = browser.new_page()
+    page.goto(f"{live.http.base_url}/#copy-0")
+    expect(page.locator("#reason")).to_contain_text("no worker monitors feeder 'copy-0'")
+    expect(page.locator("#fleet-rows tr")).to_have_count(2)
+    expect(page.locator("#fleet-counts")).to_have_text("2 undecided")
+    expect(page).to_have_title(re.compile("^UNDECIDED"))
+    page.close()
 
 
 def test_workers_need_postgresql(tmp_path: Path) -> None:
