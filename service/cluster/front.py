@@ -23,7 +23,6 @@ from gridsec.errors import GridsecError
 from gridsec.interface import Cause, Decision
 from service.access.identity import OPEN
 from service.alarms.state_machine import Alarm, AlarmUnknown
-from service.api import models
 from service.cluster.catalogue import Catalogue
 from service.cluster.exposition import merged
 from service.cluster.forward import Forwarder, get
@@ -46,7 +45,7 @@ METRICS_S: Final = 5.0
 PUT_AGAIN_S: Final = 0.5
 """Wait before a feeder of the command line is put again, s."""
 T = TypeVar("T")
-_STATE = TypeAdapter(models.State)
+_REPORT = TypeAdapter(FeederReport)
 _log = structlog.get_logger("gridsec.cluster")
 
 
@@ -86,7 +85,7 @@ class Front:
         self._subscribers: set[asyncio.Queue[str]] = set()
         self._stopping = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._latest: dict[str, tuple[tuple[str, int, float], models.State]] = {}
+        self._latest: dict[str, tuple[tuple[str, int, float], FeederReport]] = {}
         self._fetching: dict[str, asyncio.Lock] = {}
 
     def attach(self, forwarder: Forwarder) -> None:
@@ -285,7 +284,7 @@ class Front:
                 return None
             if answer.status != 200:
                 return None
-            made = _STATE.validate_json(answer.body)
+            made = _REPORT.validate_json(answer.body)
             self._latest[name] = (tag, made)
             return made
 

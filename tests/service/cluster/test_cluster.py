@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
+from feeders.format.tables import to_json
 from feeders.model.site import Site, load
 from service.cli.console import LEASE_LOST
 from tests.service.clusters import LIE_VOLT, Process, ServedCluster, Writes, served_cluster
@@ -72,6 +76,9 @@ def test_a_killed_workers_feeders_are_judged_again(cluster: Cluster, tmp_path: P
         assert live.judging_within(gone, killed) < KILLED_S
         after = live.state("copy-0")
         assert (after["verdict"], suspects(after)) == ("attacked", suspects(before))
+        stream = Events(live, "/feeders/copy-0/stream")
+        assert stream.next("state")["owner"] == after["owner"]
+        stream.close()
         assert after["owner"] != victim
         assert after["epoch"] > before["epoch"]
         assert [one["id"] for one in live.alarms()] == [alarm["id"]]
@@ -112,6 +119,79 @@ def test_no_fault_loses_or_doubles_an_alarm(cluster: Cluster, tmp_path: Path, si
             lasted = trial.strike(fault)
             assert lasted < {Fault.KILL: KILLED_S}.get(fault, FROZEN_S), fault
             assert trial.violations == []
+
+
+@pytest.mark.acceptance
+def test_feeders_and_alarms_of_several_workers(cluster: Cluster, tmp_path: Path, site: Site) -> None:
+    with served_cluster(tmp_path, cluster.database(), site, 4, 2) as live:
+        shared(live)
+        # A feeder over REST goes to the owner of its shard, which subscribes to its readings.
+        meta = replace(site.tables.meta, name="extra")
+        tables = to_json(replace(site.tables, meta=meta))
+        answer = live.http.put("/api/v1/feeders/extra", json=tables)
+        assert (answer.status_code, answer.json()["name"]) == (200, "extra")
+        assert "extra" in live.listed()
+        live.fleet.names.append("extra")
+        live.judged_within(["extra"], time.time())
+        alarms = [attack(live, name) for name in live.names]
+        assert len({live.state(one["feeder"])["owner"] for one in alarms}) == 2
+        everyone = [one["id"] for one in alarms]
+        body = {"who": "Ada", "comment": "seen", "alarms": everyone}
+        answer = live.http.post("/api/v1/alarms/ack", json=body)
+        assert [one["id"] for one in answer.json()] == everyone
+        assert {one["state"] for one in live.alarms()} == {"acknowledged"}
+        shelf = {"who": "Ada", "alarm": everyone[0], "duration_s": 60.0, "reason": "known"}
+        made = live.http.post("/api/v1/shelves", json=shelf)
+        assert made.status_code == 201
+        number = made.json()["id"]
+        ended = live.http.post(f"/api/v1/shelves/{number}/end", json={"who": "Ada", "comment": "done"})
+        assert ended.json()["t_ended"] is not None
+        live.fleet.names.remove("extra")
+        assert live.http.delete("/api/v1/feeders/extra").status_code == 204
+        assert "extra" not in live.listed()
+        assert live.http.get("/api/v1/feeders/extra").status_code == 404
+
+
+@pytest.mark.acceptance
+def test_the_streams_of_a_front(cluster: Cluster, tmp_path: Path, site: Site) -> None:
+    with served_cluster(tmp_path, cluster.database(), site, 2, 1) as live:
+        live.judged_within(live.names, time.time() - 1.0)
+        states, alarms = (Events(live, path) for path in ("/feeders/copy-0/stream", "/alarms/stream?after=0"))
+        try:
+            first, second = states.next("state"), states.next("state")
+            assert (first["feeder"], first["owner"]) == ("copy-0", "w0")
+            assert second["t"] == first["t"] + 1.0
+            alarm = attack(live, "copy-1")
+            assert alarms.next("alarm")["alarm"]["id"] == alarm["id"]
+            acknowledge(live, alarm)
+            assert alarms.next("alarm")["change"] == "acknowledged"
+        finally:
+            states.close()
+            alarms.close()
+
+
+class Events:
+    """A client of one stream of server-sent events."""
+
+    def __init__(self, live: ServedCluster, path: str) -> None:
+        self.client = httpx.Client(base_url=live.http.base_url, timeout=20.0)
+        self.context = self.client.stream("GET", f"/api/v1{path}")
+        self.lines = self.context.__enter__().iter_lines()
+
+    def next(self, kind: str) -> dict[str, Any]:
+        """Data of the next event of a kind."""
+        seen = ""
+        for line in self.lines:
+            name, _, value = line.partition(": ")
+            if name == "event":
+                seen = value
+            elif name == "data" and seen == kind:
+                return dict(json.loads(value))
+        raise AssertionError(f"the stream has ended before {kind}")
+
+    def close(self) -> None:
+        self.context.__exit__(None, None, None)
+        self.client.close()
 
 
 @pytest.mark.acceptance
