@@ -309,6 +309,27 @@ class Connections:
             yield connection
 
     @contextmanager
+    def write_once(self, key: int | None) -> Iterator[tuple[sa.Connection, bool]]:
+        """Begin a transaction as `write`; it sets the key of the last commit.
+
+        Returns connection, stored: True if the last commit had this key; the block then must not write.
+        """
+        stored = False
+
+        def check(connection: sa.Connection) -> None:
+            nonlocal stored
+            stored = False
+            if key is not None:
+                other = WRITER.update().where(WRITER.c.owner == self._owner, WRITER.c.commits != key)
+                if connection.execute(other.values(commits=key)).rowcount:
+                    return
+                stored = True
+            self._check_owner(connection)
+
+        with self._guard("write"), self._begin(check) as connection:
+            yield connection, stored
+
+    @contextmanager
     def opening(self) -> Iterator[sa.Connection]:
         """Begin the first transaction of the writer; `own` must be called in it."""
         with self._guard("open"), self._begin(lambda _: None) as connection:
@@ -335,11 +356,6 @@ class Connections:
         """Write a counter."""
         own = WRITER.update().where(WRITER.c.owner == self._owner)
         connection.execute(own.values(checks=WRITER.c.checks + 1))
-
-    def stored_before(self, connection: sa.Connection, key: int) -> bool:
-        """True if the last commit had this key; the transaction sets it."""
-        other = WRITER.update().where(WRITER.c.owner == self._owner, WRITER.c.commits != key)
-        return connection.execute(other.values(commits=key)).rowcount == 0
 
     @property
     def beat_s(self) -> float | None:

@@ -138,6 +138,13 @@ def prepare(
     return writes
 
 
+def suppressions_change(writes: Iterable[IncidentWrite]) -> bool:
+    """True if shelves or planned works change."""
+    return any(
+        (one.before.shelves, one.before.works) != (one.after.shelves, one.after.works) for one in writes
+    )
+
+
 def store(connection: sa.Connection, insert: Any, writes: Iterable[IncidentWrite]) -> int:
     """Store changes of incidents after their alarms; return the number of the newest event, or 0.
 

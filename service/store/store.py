@@ -549,7 +549,11 @@ class Store(Reader):
         the lower one.
         """
         if self._leases is not None:
-            connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_EVENT_LOCK)))
+            connection.execute(sa.select(self._numbering()))
+
+    @staticmethod
+    def _numbering() -> sa.ColumnElement[Any]:
+        return sa.func.pg_advisory_xact_lock(_EVENT_LOCK)
 
     def _adopt(self) -> None:
         """Forget the feeders of released and lost shards: other workers continue their history."""
@@ -596,7 +600,8 @@ class Store(Reader):
         if now is None:
             now = max((item.t for item in transitions), default=-math.inf)
         with self._alone():
-            grouped = bool(transitions or actions or self.due(now))
+            due_now = self.due(now)
+            grouped = bool(transitions or actions or due_now)
             self._adopt()
             marks, rolled = dict(self._marks), dict(self._rolled)
             worthy = [report for report in reports if self._worth(marks, report)]
@@ -607,11 +612,13 @@ class Store(Reader):
             feeders |= {item.feeder for item in happened}
             feeders |= {name for name in (without, put and put[0]) if name is not None}
             newest, following = self._last_incident_event, self._due
-            with self._connections.write() as connection:
-                if key is not None and self._connections.stored_before(connection, key):
+            with self._connections.write_once(key) as (connection, stored):
+                if stored:
                     numbers = self._numbers_of(connection, transitions)
+                    newest = connection.scalar(sa.select(sa.func.max(INCIDENT_EVENT.c.seq))) or 0
+                    moved = True
                 else:
-                    due = incidents.feeders_due(connection, now, self.mine) if grouped else set[str]()
+                    due = incidents.feeders_due(connection, now, self.mine) if due_now else set[str]()
                     self._check(connection, feeders | due)
                     self._put_history(connection, worthy, rolled)
                     if rejected:
@@ -625,12 +632,13 @@ class Store(Reader):
                     if put is not None:
                         self._put_feeder(connection, *put)
                     # Last: other workers wait for the numbers.
-                    numbers = self._put_events(connection, transitions, actions, now, due)
-                if grouped:
-                    newest = connection.scalar(sa.select(sa.func.max(INCIDENT_EVENT.c.seq))) or 0
+                    grouping = incidents.prepare(connection, transitions, actions, now, due)
+                    numbers, newest = self._put_events(connection, transitions, grouping)
+                    moved = due_now or incidents.suppressions_change(grouping)
+                if moved:
                     following = incidents.next_due(connection, self.mine)
             self._marks, self._rolled, self._due = marks, rolled, following
-            self._last_incident_event = newest
+            self._last_incident_event = max(self._last_incident_event, newest)
             self._last_event = max((self._last_event, *numbers))
             return numbers
 
@@ -678,18 +686,17 @@ class Store(Reader):
         self,
         connection: sa.Connection,
         transitions: Sequence[AlarmTransition],
-        actions: Sequence[Action],
-        now: float,
-        due: Collection[str],
-    ) -> tuple[int, ...]:
-        """Store transitions and the changes of their incidents; return the numbers of the events."""
-        if not (transitions or actions or due):
-            return ()
-        grouping = incidents.prepare(connection, transitions, actions, now, due)
-        self._number_events(connection)
+        grouping: Sequence[incidents.IncidentWrite],
+    ) -> tuple[tuple[int, ...], int]:
+        """Store transitions and the changes of their incidents.
+
+        Returns numbers, newest: the number of the event of each transition, and that of the newest event of
+        an incident or 0.
+        """
+        if not transitions and grouping:
+            self._number_events(connection)
         numbers = tuple(self._put_transition(connection, item) for item in transitions)
-        incidents.store(connection, self._connections.insert, grouping)
-        return numbers
+        return numbers, incidents.store(connection, self._connections.insert, grouping)
 
     def _put_transition(self, connection: sa.Connection, transition: AlarmTransition) -> int:
         alarm = transition.alarm
@@ -706,9 +713,12 @@ class Store(Reader):
             "words": words_of(alarm),
             "data": data,
         }
-        connection.execute(
-            self._connections.insert(ALARM).values(row).on_conflict_do_update(index_elements=["id"], set_=row)
-        )
+        statement = self._connections.insert(ALARM).values(row)
+        statement = statement.on_conflict_do_update(index_elements=["id"], set_=row)
+        if self._leases is not None:
+            # The lock of `_number_events`, in the call before the number.
+            statement = statement.returning(self._numbering())
+        connection.execute(statement)
         event = {
             "alarm_id": alarm.id,
             "feeder": alarm.feeder,

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
+from multiprocessing.synchronize import Barrier
 from random import Random
 
 import psycopg
@@ -356,11 +357,11 @@ def write_events(worker: Worker, first: int, commits: int) -> None:
     alarms = [an_alarm(first + k, feeder=feeder) for k, feeder in enumerate(worker.feeders(8))]
     original = worker.store._put_events
 
-    def slow(*arguments: object) -> tuple[int, ...]:
-        numbers = original(*arguments)  # type: ignore[arg-type]
+    def slow(*arguments: object) -> tuple[tuple[int, ...], int]:
+        found = original(*arguments)  # type: ignore[arg-type]
         if random.random() < 0.2:
             time.sleep(0.004 * random.random())
-        return numbers
+        return found
 
     worker.store._put_events = slow  # type: ignore[method-assign,assignment]
     for count in range(1, commits + 1):
@@ -391,38 +392,49 @@ def test_a_reader_that_follows_misses_no_event(url: str, join: Join) -> None:
 def test_a_reader_misses_events_without_the_lock(
     url: str, join: Join, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Store, "_number_events", lambda *_: None)
+    monkeypatch.setattr(Store, "_numbering", staticmethod(sa.null))
     missed, seen = run_threads(url, join("a", "b", "c", "d"), 300)
     print(f"{missed} events missed, {seen} seen")
     assert missed > 0
 
 
-def write_in_process(url: str, name: str, first: int, commits: int) -> None:
+def write_in_process(url: str, name: str, first: int, commits: int, together: Barrier) -> None:
     leases.SETTLE_S = 2.0  # type: ignore[misc]
     worker = Worker(url, name)
+    ended = threading.Event()
+
+    def keep() -> None:
+        while not ended.wait(0.5):
+            worker.leases.renew()
+
+    thread = threading.Thread(target=keep)
+    thread.start()
     end = time.monotonic() + 60.0
-    while len(worker.leases.held) < leases.SHARDS // 4 or len(worker.leases.live_workers()) < 4:
+    while len(worker.leases.held) < leases.SHARDS // 4 or worker.leases.excess():
         assert time.monotonic() < end
         worker.leases.release(worker.leases.excess())
         worker.leases.claim()
-        worker.leases.renew()
         time.sleep(0.1)
+    together.wait(60.0)
     write_events(worker, first, commits)
+    together.wait(120.0)
+    ended.set()
+    thread.join()
     worker.close()
 
 
 @pytest.mark.acceptance
 def test_a_reader_misses_no_event_of_four_processes(url: str) -> None:
     spawn = multiprocessing.get_context("spawn")
-    follower = Follower(url)
+    follower, together = Follower(url), spawn.Barrier(4)
     processes = [
-        spawn.Process(target=write_in_process, args=(url, name, 100_000 * k, 300))
+        spawn.Process(target=write_in_process, args=(url, name, 100_000 * k, 300, together))
         for k, name in enumerate("abcd", 1)
     ]
     for process in processes:
         process.start()
     for process in processes:
-        process.join(timeout=120.0)
+        process.join(timeout=240.0)
     assert [process.exitcode for process in processes] == [0, 0, 0, 0]
     assert follower.missed() == 0
     assert len(follower.seen) > 2000
