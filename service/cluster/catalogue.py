@@ -35,7 +35,7 @@ class Listed:
     @property
     def title(self) -> str:
         """Title of the feeder, or its name."""
-        return str(self.tables.get("meta", {}).get("title") or self.name)
+        return str(self.tables.get("feeder", {}).get("title") or self.name)
 
     @property
     def meters(self) -> tuple[str, ...]:

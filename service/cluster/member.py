@@ -199,9 +199,10 @@ class Member:
         leaving = [name for name in self._ours if shard_of(name) in set(shards)]
         for name in leaving:
             readings.unfollow(name)
+        # After a failure they are taken back as new ones.
+        self._ours -= set(leaving)
         if leaving and not await self._attempt(host.resign(leaving)):
             return
-        self._ours -= set(leaving)
         await self._asked("release shards in", self._leases.release, shards)
         _log.info("shards are released", shards=len(shards), feeders=leaving)
 
