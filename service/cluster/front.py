@@ -49,6 +49,14 @@ _REPORT = TypeAdapter(FeederReport)
 _log = structlog.get_logger("gridsec.cluster")
 
 
+class ObservedStore(Store):
+    """Database of a front, which writes nothing."""
+
+    def check(self) -> None:
+        """Test a read. Raises StoreUnavailable if the database does not answer."""
+        self.refresh()
+
+
 class Front:
     """Backend of the API over workers.
 

@@ -16,14 +16,13 @@ from service.app import HttpSide, Running, bus_config, load_sites, read_notify
 from service.cluster.catalogue import Catalogue
 from service.cluster.envelope import Envelope
 from service.cluster.forward import Forwarder
-from service.cluster.front import Front
+from service.cluster.front import Front, ObservedStore
 from service.cluster.status import STATES
 from service.cluster.supervisor import Supervisor, worker_environment
 from service.cluster.workers import Workers
 from service.ingest.align import Clock
 from service.ingest.zenoh_bus import Bus
 from service.settings import ENV_PREFIX, Settings, SettingsInvalid
-from service.store import Store
 from service.store.cluster_secret import cluster_secret
 from service.store.committer import missed
 from service.store.leases import Leases
@@ -71,7 +70,7 @@ async def serve_front(
     with ExitStack() as stack:
         leases = stack.enter_context(Leases(settings.database, OBSERVER))
         envelope = Envelope(cluster_secret(settings.database), wall)
-        store = stack.enter_context(Store(settings.database, leases=leases))
+        store = stack.enter_context(ObservedStore(settings.database, leases=leases))
         http = HttpSide.open(stack, settings, shares, targets, wall)
         workers = Workers(envelope)
         front = Front(

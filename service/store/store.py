@@ -667,10 +667,7 @@ class Store(Reader):
         return [number for number, feeder in found if feeder in own]
 
     def check(self) -> None:
-        """Test a write, or a read of an observer. Raises StoreUnavailable if it fails."""
-        if self._leases is not None and not self._leases.number:
-            self.refresh()
-            return
+        """Test a write. Raises StoreUnavailable if the database cannot be written."""
         with self._write() as connection:
             self._connections.count_check(connection)
 
