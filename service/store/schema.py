@@ -372,8 +372,8 @@ MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
 )
 """Step k migrates schema version k + 1 to k + 2. A new database starts at the newest version.
 
-Steps after `_add_workers` only add tables, and columns that may be null or have a default of the server: workers
-of the earlier version go on meanwhile.
+Steps after `_add_workers` only add tables, and columns that may be null or have a default of the server:
+workers of the earlier version go on meanwhile.
 """
 
 
