@@ -54,8 +54,8 @@ from service.report.tick_state import TickState
 from service.store import Rejected, Store
 from service.store.committer import Committer, Executor, Publisher, Wish, alarm_key, incident_key, inline
 from service.store.schema import CommissioningEvent
+from service.store.series import Mark, mark, worth_keeping
 from service.store.state_codec import StateSnapshot
-from service.store.store import Mark, mark, worth_keeping
 
 BAD_PER_SOURCE = 5
 """Bad readings of one round, key and reason that are stored separately; the others become one entry."""

@@ -3,7 +3,8 @@
 SQLite or PostgreSQL, by SQLAlchemy's Core. One transaction contains an alarm's state, its event and the
 outbox entry for its publication; readers see all three or none.
 
-There is one writer: one connection in one process, protected by a lock that ends with the process. SQLite
+There is one writer, or several workers with leases of feeders on PostgreSQL (`leases`). The writer is one
+connection in one process, protected by a lock that ends with the process. SQLite
 before 3.51.3 can corrupt a WAL database that two connections write or checkpoint at once; the readers here
 have connections of their own, which cannot write. Every commit is durable when `commit` returns
 (`synchronous=FULL`, `synchronous_commit=on`).
@@ -14,14 +15,16 @@ A call to PostgreSQL has a time limit. `OutcomeUnknown` is a commit without an a
 same key again stores it, or finds it stored. After `WriterLost` a store writes nothing more.
 """
 
-from service.store.schema import AlarmEvent, OutcomeUnknown, Rejected, StoreUnavailable, WriterLost
-from service.store.store import BAD_READINGS_KEPT, AlarmCounts, HistoryRules, Store
+from service.store.schema import AlarmEvent, LeaseLost, OutcomeUnknown, Rejected, StoreUnavailable, WriterLost
+from service.store.series import HistoryRules
+from service.store.store import BAD_READINGS_KEPT, AlarmCounts, Store
 
 __all__ = [
     "BAD_READINGS_KEPT",
     "AlarmCounts",
     "AlarmEvent",
     "HistoryRules",
+    "LeaseLost",
     "OutcomeUnknown",
     "Rejected",
     "Store",

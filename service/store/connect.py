@@ -24,7 +24,7 @@ from psycopg.abc import PQGen
 from psycopg.waiting import Ready
 from sqlalchemy.dialects import postgresql, sqlite
 
-from service.store.schema import SHARD, WORKER, WRITER, OutcomeUnknown, StoreUnavailable, WriterLost
+from service.store.schema import OPEN_S, SHARD, WORKER, WRITER, OutcomeUnknown, StoreUnavailable, WriterLost
 
 CALL_S = 5.0
 """Time limit of a call without any response of the server, s."""
@@ -36,10 +36,9 @@ LOCK_S = 12.0
 """Wait for the lock at the start, s; above `IDLE_S`, so that the session of a stopped writer ends first."""
 RELOCK_S = 3.0
 """Wait for the lock after a broken connection, s; below `CALL_S`."""
-HELD_S = 2.0
-"""Time without a call after which the server ends a transaction of a worker, and with it its locks, s."""
-OPEN_S = 60.0
-"""Time limit of a call while the database is opened, s: a migration may take longer than a write."""
+HELD_S = 4.0
+"""Time without a call after which the server ends a transaction of a worker, and with it its locks, s; below
+`leases.EXPIRY_S`."""
 ADVISORY_LOCK = 0x6772_6964_7365_6300
 _ENDED_BY_SERVER = frozenset({"57P01", "57P05", "25P03"})
 """SQLSTATE of an ended session: by an administrator, idle, idle in a transaction."""

@@ -28,7 +28,7 @@ from sqlalchemy.dialects import postgresql
 
 from service.store import connect
 from service.store.connect import CALL_S, HELD_S, RELOCK_S, NoAnswer, Timed, code_of, share_database
-from service.store.schema import SHARD, WORKER, LeaseLost, StoreUnavailable, migrate
+from service.store.schema import OPEN_S, SHARD, WORKER, LeaseLost, StoreUnavailable, migrate
 
 SHARDS: Final = 256
 """Number of shards."""
@@ -129,7 +129,8 @@ class Leases:
         # Beginning of each absence in this process's monotonic time, s, within one session.
         self._absent: dict[int, float] = {}
         self._engine, self.name = _engine(database, self._connected)
-        self._wait_s = connect.LOCK_S
+        self._wait_s, self._limit_s = connect.LOCK_S, OPEN_S
+        self._session: Timed | None = None
         self.weigh(weights or {})
         try:
             with self._transaction() as connection:
@@ -139,7 +140,7 @@ class Leases:
         except BaseException:
             self._engine.dispose()
             raise
-        self._wait_s = RELOCK_S
+        self._opened()
 
     def __enter__(self) -> Leases:
         """Return the leases."""
@@ -368,13 +369,21 @@ class Leases:
         made = Timed.connect(*arguments, **options)
         try:
             share_database(made, self.name, self._wait_s)
+            made.limit_s = self._limit_s
             if self._number is not None:
                 made.execute("SELECT pg_advisory_lock_shared(%s, %s)", (WORKER_LOCKS, self._number))
                 made.commit()
         except BaseException:
             made.close()
             raise
+        self._session = made
         return made
+
+    def _opened(self) -> None:
+        """Set the time limits of calls after the database is open."""
+        self._wait_s, self._limit_s = RELOCK_S, CALL_S
+        if self._session is not None:
+            self._session.limit_s = CALL_S
 
     @contextmanager
     def _transaction(self) -> Iterator[sa.Connection]:

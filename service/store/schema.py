@@ -89,6 +89,8 @@ class Rejected:
 META = sa.MetaData()
 SEQ = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
 
+OPEN_S = 60.0
+"""Time limit of a call while the database is opened, s: a migration may take longer than a write."""
 _MIGRATION_LOCK = 0x6772_6964_6D69_6700
 
 VERSION = sa.Table("schema_version", META, sa.Column("version", sa.Integer, nullable=False))
@@ -368,7 +370,11 @@ MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
     _add_incidents,
     _add_workers,
 )
-"""Step k migrates schema version k + 1 to k + 2. A new database starts at the newest version."""
+"""Step k migrates schema version k + 1 to k + 2. A new database starts at the newest version.
+
+Steps after `_add_workers` only add tables, and columns that may be null or have a default of the server:
+workers of the earlier version go on meanwhile.
+"""
 
 
 def migrate(connection: sa.Connection, name: str) -> None:
@@ -378,7 +384,9 @@ def migrate(connection: sa.Connection, name: str) -> None:
     """
     newest = 1 + len(MIGRATIONS)
     if connection.dialect.name == "postgresql":
-        # Several workers may open the database at once.
+        # Several workers may open the database at once, and a migration takes longer than a write.
+        for limit in ("lock_timeout", "idle_in_transaction_session_timeout"):
+            connection.exec_driver_sql(f"SET LOCAL {limit} = '{OPEN_S:g}s'")
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_MIGRATION_LOCK)))
     if not sa.inspect(connection).has_table(VERSION.name):
         META.create_all(connection)

@@ -1,4 +1,4 @@
-"""Rows of the history, their roll-ups, and the minimum and maximum of each bucket of a time series.
+"""Rows of the history, their selection and roll-ups, and extremes of each bucket of a time series.
 
 A row holds all meters of one kept tick: columns of float32 (NaN for None), then one byte of flags per meter,
 compressed. A roll-up holds the extremes of all rows of `ROLLUP_S`. A series merges rows, or roll-ups and the
@@ -15,12 +15,12 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats
-from gridsec.interface import Decision
+from gridsec.interface import Cause, Decision
 from service.report.report import BUSBAR, FeederReport, MeterState, finite
 
 # --- Rows ---
@@ -366,3 +366,58 @@ def of_rollups(found: Sequence[Mapping[str, Any]], wanted: Sequence[str]) -> Buc
         extremes,
         flags,
     )
+
+
+# --- Selection of the kept ticks ---
+
+
+@dataclass(frozen=True, slots=True)
+class HistoryRules:
+    """Grid and duration of the history."""
+
+    step_s: float = 10.0  # grid of the kept ticks, s; 0 keeps all
+    keep_s: float = 14 * 86400.0  # time for which they are kept, s
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """The last kept tick, which the selection compares with."""
+
+    t: float
+    verdict: str
+    cause: str
+    suspects: tuple[str, ...]
+
+
+class Marked(Protocol):
+    """Tick that the history may keep: a report, or the result that it is built from."""
+
+    @property
+    def t(self) -> float:
+        """Unix time, s."""
+
+    @property
+    def verdict(self) -> Decision:
+        """Verdict."""
+
+    @property
+    def cause(self) -> Cause:
+        """Cause of the verdict."""
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        """Meters that the verdict names as manipulated."""
+
+
+def mark(report: Marked) -> Mark:
+    """Return the mark of a tick."""
+    return Mark(report.t, str(report.verdict), str(report.cause), report.suspects)
+
+
+def worth_keeping(last: Mark | None, now: Mark, rules: HistoryRules) -> bool:
+    """True if a tick gets a row."""
+    if last is None or now.t < last.t:
+        return True
+    changed = (last.verdict, last.cause, last.suspects) != (now.verdict, now.cause, now.suspects)
+    step = rules.step_s
+    return changed or step <= 0.0 or math.floor(now.t / step) > math.floor(last.t / step)

@@ -14,12 +14,11 @@ import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import sqlalchemy as sa
 import structlog
 
-from gridsec.interface import Cause, Decision
 from service.alarms.incidents import Action, IncidentEvent, Shelf
 from service.alarms.state_machine import Alarm, AlarmState, AlarmTransition, Change, from_json, to_json
 from service.report.report import FeederReport
@@ -59,7 +58,7 @@ from service.store.schema import (
     migrate,
     words_of,
 )
-from service.store.series import Series, pack, rows, unpack
+from service.store.series import HistoryRules, Mark, Series, mark, pack, rows, unpack, worth_keeping
 from service.store.state_codec import SnapshotKind, StateSnapshot
 
 T = TypeVar("T", bound="AlarmEvent | IncidentEvent")
@@ -865,55 +864,3 @@ def _put_rejected(connection: sa.Connection, rejected: Iterable[Rejected]) -> No
         return
     newest = sa.select(sa.func.max(BAD.c.seq)).scalar_subquery()
     connection.execute(BAD.delete().where(BAD.c.seq <= newest - BAD_READINGS_KEPT))
-
-
-@dataclass(frozen=True, slots=True)
-class HistoryRules:
-    """Grid and duration of the history."""
-
-    step_s: float = 10.0  # grid of the kept ticks, s; 0 keeps all
-    keep_s: float = 14 * 86400.0  # time for which they are kept, s
-
-
-@dataclass(frozen=True, slots=True)
-class Mark:
-    """The last kept tick, which the selection compares with."""
-
-    t: float
-    verdict: str
-    cause: str
-    suspects: tuple[str, ...]
-
-
-class Marked(Protocol):
-    """Tick that the history may keep: a report, or the result that it is built from."""
-
-    @property
-    def t(self) -> float:
-        """Unix time, s."""
-
-    @property
-    def verdict(self) -> Decision:
-        """Verdict."""
-
-    @property
-    def cause(self) -> Cause:
-        """Cause of the verdict."""
-
-    @property
-    def suspects(self) -> tuple[str, ...]:
-        """Meters that the verdict names as manipulated."""
-
-
-def mark(report: Marked) -> Mark:
-    """Return the mark of a tick."""
-    return Mark(report.t, str(report.verdict), str(report.cause), report.suspects)
-
-
-def worth_keeping(last: Mark | None, now: Mark, rules: HistoryRules) -> bool:
-    """True if a tick gets a row."""
-    if last is None or now.t < last.t:
-        return True
-    changed = (last.verdict, last.cause, last.suspects) != (now.verdict, now.cause, now.suspects)
-    step = rules.step_s
-    return changed or step <= 0.0 or math.floor(now.t / step) > math.floor(last.t / step)

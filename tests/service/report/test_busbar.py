@@ -28,8 +28,8 @@ from service.engine.feeder_monitor import FeederMonitor, align_rules, design
 from service.ingest.align import Clock, Tick
 from service.ingest.reading import Reading
 from service.report.report import BUSBAR, BusbarMeterState, FeederReport, blind, build, busbar_report, to_json
+from service.store.series import pack, rows, unpack
 from service.store.state_codec import KeptInvalid, decode_distrust, encode_distrust
-from service.store.store import pack, rows, unpack
 from tests.codes import refused
 from tests.service.commands import command, plain
 from tests.service.played import ingest

@@ -6,8 +6,7 @@ from hypothesis import strategies as st
 
 from gridsec.interface import Cause, Decision
 from service.report.report import FeederReport, MeterState
-from service.store.series import pack, unpack
-from service.store.store import HistoryRules, mark, worth_keeping
+from service.store.series import HistoryRules, mark, pack, unpack, worth_keeping
 
 numbers = st.none() | st.floats(allow_nan=False, allow_infinity=False, width=32)
 meters = st.builds(

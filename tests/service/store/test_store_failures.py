@@ -20,8 +20,8 @@ from service.alarms.state_machine import AlarmState, acknowledged
 from service.report.report import FeederReport
 from service.store import Store, StoreUnavailable, WriterLost, connect, schema
 from service.store.schema import CommissioningChange, CommissioningEvent
+from service.store.series import pack, rows
 from service.store.state_codec import SnapshotKind, StateSnapshot
-from service.store.store import pack, rows
 from tests.codes import refused
 from tests.service.databases import Cluster, both
 from tests.service.reports import meter, report
@@ -181,14 +181,21 @@ OLD_LAYOUT = sa.Table(
 """As it was until version 3."""
 
 
-def put_back_incidents(connection: sa.Connection) -> None:
-    """Make a database one of version 5."""
-    incidents = (schema.INCIDENT_EVENT, schema.INCIDENT, schema.SHELF, schema.WORK)
-    workers = (schema.WORKER, schema.SHARD, schema.FEEDER_CHANGES)
-    for table in (*workers, schema.ROLLUP, *incidents):
+def put_back_workers(connection: sa.Connection) -> None:
+    """Make a database one of version 7."""
+    for table in (schema.WORKER, schema.SHARD, schema.FEEDER_CHANGES):
         table.drop(connection)
     connection.exec_driver_sql("ALTER TABLE writer DROP COLUMN worker")
     connection.exec_driver_sql("ALTER TABLE feeder DROP COLUMN version")
+    connection.execute(schema.VERSION.update().values(version=7))
+
+
+def put_back_incidents(connection: sa.Connection) -> None:
+    """Make a database one of version 5."""
+    incidents = (schema.INCIDENT_EVENT, schema.INCIDENT, schema.SHELF, schema.WORK)
+    put_back_workers(connection)
+    for table in (schema.ROLLUP, *incidents):
+        table.drop(connection)
     connection.exec_driver_sql("DROP INDEX alarm_by_incident")
     for column in ("incident", "work", "words"):
         connection.exec_driver_sql(f"ALTER TABLE alarm DROP COLUMN {column}")
