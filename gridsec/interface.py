@@ -48,6 +48,7 @@ class Cause(StrEnum):
     MISFIT = "misfit"
     DESIGN_INVALID = "design-invalid"
     OVERLOAD = "overload"
+    NO_OWNER = "no-owner"
 
 
 class ManipulationKind(StrEnum):

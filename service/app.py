@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import structlog
 
@@ -22,6 +22,7 @@ from gridsec.errors import FeederInvalid, GridsecError, InputInvalid, Problem
 from service import systemd
 from service.access.tokens import TokenVerifier
 from service.api.access import Authenticator
+from service.api.dependencies import Backend, Forward
 from service.api.listener import BoundedServer, Shares, raise_limit
 from service.api.routes import MAX_STREAMS, create_api
 from service.engine.engine import RuntimeConfig
@@ -30,6 +31,7 @@ from service.errors import prefixed
 from service.ingest.align import Clock
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import Bus
+from service.metrics import Metrics
 from service.notify.delivery import Notifier
 from service.notify.notices import IncidentSource
 from service.notify.targets import Targets, read_targets
@@ -75,18 +77,14 @@ async def serve(
     """
     shares = Shares.of(raise_limit())
     meter_keys = settings.read_meter_keys()
-    targets = _targets(settings)
+    targets = read_notify(settings)
     sites = {
         name: choose(site, estimator=settings.estimator)
         for name, site in load_sites(settings.feeders).items()
     }
     with ExitStack() as stack:
         store = stack.enter_context(Store(settings.database))
-        authenticator = Authenticator(
-            stack.enter_context(AccessStore(settings.database)), _tokens(settings), wall
-        )
-        stack.callback(authenticator.close)
-        _check_exposure(settings, authenticator)
+        http = HttpSide.open(stack, settings, shares, targets, wall)
         given = tuple(sites)
         stored, unloaded = _stored(sites, store)
         sites |= stored
@@ -104,17 +102,9 @@ async def serve(
         runtime = Runtime(
             config, store, sites.values(), given=given, unloaded=unloaded, wall=wall, settled=settled
         )
-        listener = stack.enter_context(_listen(settings.http))
         bus = stack.enter_context(
             Bus(
-                BusConfig(
-                    settings.zenoh_mode,
-                    settings.listen,
-                    settings.zenoh_connect,
-                    settings.zenoh_config,
-                    max_sessions=shares.sessions,
-                    accept_pending=shares.pending,
-                ),
+                bus_config(settings, shares),
                 settings.prefix,
                 runtime.deliver,
                 max_payload=settings.max_payload,
@@ -124,26 +114,100 @@ async def serve(
             )
         )
         runtime.attach(bus)
-        notifier = _notifier(stack, settings, targets, store, runtime, wall=wall)
+        await http.serve(stack, runtime, tuple(sites), announce=announce, signals=signals, stopping=stopping)
+
+
+def bus_config(settings: Settings, shares: Shares) -> BusConfig:
+    """Return the configuration of the zenoh session."""
+    return BusConfig(
+        settings.zenoh_mode,
+        settings.listen,
+        settings.zenoh_connect,
+        settings.zenoh_config,
+        max_sessions=shares.sessions,
+        accept_pending=shares.pending,
+    )
+
+
+class Served(Backend, Protocol):
+    """Service behind the HTTP application, such as `Runtime`."""
+
+    async def run(self) -> None:
+        """Run until `stop`."""
+
+    def stop(self) -> None:
+        """End `run` and every subscription soon; called from the event loop."""
+
+    @property
+    def counters(self) -> Metrics:
+        """Counters and gauges of this process."""
+
+
+@dataclass(frozen=True, slots=True)
+class HttpSide:
+    """HTTP address, authentication and notifications of a service."""
+
+    settings: Settings
+    shares: Shares
+    targets: Targets | None
+    authenticator: Authenticator
+    listener: socket.socket
+    wall: Callable[[], float]
+
+    @classmethod
+    def open(
+        cls,
+        stack: ExitStack,
+        settings: Settings,
+        shares: Shares,
+        targets: Targets | None,
+        wall: Callable[[], float],
+    ) -> HttpSide:
+        """Open it until the end of the stack.
+
+        Raises SettingsInvalid, AddressUnavailable, StoreUnavailable if it cannot be opened.
+        """
+        authenticator = Authenticator(
+            stack.enter_context(AccessStore(settings.database)), _tokens(settings), wall
+        )
+        stack.callback(authenticator.close)
+        _check_exposure(settings, authenticator)
+        listener = stack.enter_context(_listen(settings.http))
+        return cls(settings, shares, targets, authenticator, listener, wall)
+
+    async def serve(
+        self,
+        stack: ExitStack,
+        service: Served,
+        feeders: tuple[str, ...],
+        *,
+        forward: Forward | None = None,
+        announce: Callable[[Running], None],
+        signals: bool,
+        stopping: Callable[[], None],
+    ) -> None:
+        """Run the service and its HTTP application until a signal or `Running.stop`."""
+        notifier = _notifier(stack, self.settings, self.targets, service, wall=self.wall)
         api = create_api(
-            runtime,
-            settings.http_hosts,
-            max_streams=min(MAX_STREAMS, shares.streams),
-            authenticator=authenticator,
+            service,
+            self.settings.http_hosts,
+            max_streams=min(MAX_STREAMS, self.shares.streams),
+            authenticator=self.authenticator,
             notifier=notifier,
+            forward=forward,
         )
         server = _Server(
             api,
-            shares.http,
+            self.shares.http,
             lifespan="off",
             log_config=None,
             access_log=False,
             timeout_graceful_shutdown=_GRACE_S,
             server_header=False,
         )
-        with _waking(notifier, runtime):
+        with _waking(notifier, service):
             await _run(
-                runtime, server, listener, tuple(sites), announce=announce, signals=signals, stopping=stopping
+                service, server, self.listener, feeders, announce=announce, signals=signals, stopping=stopping
             )
 
 
@@ -156,7 +220,7 @@ def _tokens(settings: Settings) -> TokenVerifier | None:
     )
 
 
-def _targets(settings: Settings) -> Targets | None:
+def read_notify(settings: Settings) -> Targets | None:
     """Targets of notifications; None without a file. Raises SettingsInvalid if the file is wrong."""
     if settings.notify is None:
         return None
@@ -171,8 +235,7 @@ def _notifier(
     stack: ExitStack,
     settings: Settings,
     targets: Targets | None,
-    store: Store,
-    runtime: Runtime,
+    service: Served,
     *,
     wall: Callable[[], float],
 ) -> Notifier | None:
@@ -180,20 +243,20 @@ def _notifier(
     if targets is None:
         return None
     deliveries = stack.enter_context(DeliveryStore(settings.database))
-    notifier = Notifier(targets, IncidentSource(store), deliveries, runtime.counters, wall)
+    notifier = Notifier(targets, IncidentSource(service.store), deliveries, service.counters, wall)
     stack.callback(notifier.close)
     return notifier
 
 
 @contextlib.contextmanager
-def _waking(notifier: Notifier | None, runtime: Runtime) -> Iterator[None]:
+def _waking(notifier: Notifier | None, service: Served) -> Iterator[None]:
     """Start the notifier, and wake it after stored events, until the block ends."""
     if notifier is None:
         yield
         return
 
     async def wake() -> None:
-        async for _ in runtime.subscribe():
+        async for _ in service.subscribe():
             notifier.wake()
 
     notifier.start()
@@ -219,7 +282,7 @@ def _check_exposure(settings: Settings, authenticator: Authenticator) -> None:
 
 
 async def _run(
-    runtime: Runtime,
+    service: Served,
     server: _Server,
     listener: socket.socket,
     feeders: tuple[str, ...],
@@ -229,8 +292,8 @@ async def _run(
     stopping: Callable[[], None],
 ) -> None:
     stop = asyncio.Event()
-    with _signals(stop) if signals else contextlib.nullcontext():
-        watching = asyncio.create_task(runtime.run(), name="runtime")
+    with stop_on_signals(stop, active=signals):
+        watching = asyncio.create_task(service.run(), name="runtime")
         serving = asyncio.create_task(server.serve(sockets=[listener]), name="http")
         stopped = asyncio.create_task(stop.wait(), name="stop")
         started = asyncio.create_task(server.up.wait(), name="started")
@@ -240,13 +303,13 @@ async def _run(
         url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
         _log.info("serving", url=url, feeders=list(feeders))
         announce(Running(url, feeders, stop.set))
-        supervised = asyncio.create_task(systemd.supervise(lambda: runtime.healthy()[0]), name="systemd")
+        supervised = asyncio.create_task(systemd.supervise(lambda: service.healthy()[0]), name="systemd")
         await asyncio.wait({watching, serving, stopped}, return_when=asyncio.FIRST_COMPLETED)
         stopping()
         stopped.cancel()
         supervised.cancel()
         systemd.notify("STOPPING=1")
-        runtime.stop()
+        service.stop()
         server.should_exit = True
         results = await asyncio.gather(watching, serving, return_exceptions=True)
     for result in results:
@@ -276,7 +339,11 @@ class _Server(BoundedServer):
 
 
 @contextlib.contextmanager
-def _signals(stop: asyncio.Event) -> Iterator[None]:
+def stop_on_signals(stop: asyncio.Event, *, active: bool = True) -> Iterator[None]:
+    """Set an event at SIGINT and SIGTERM, if `active`: only the main thread can."""
+    if not active:
+        yield
+        return
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)

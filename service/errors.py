@@ -57,3 +57,12 @@ class TooManyFeeders(GridsecError):
 
     def __init__(self, most: int) -> None:
         super().__init__(f"the limit of {most} feeders over REST is reached; delete one first")
+
+
+class NoOwner(GridsecError):
+    """No worker monitors the feeder at the moment."""
+
+    code = "no-owner"
+
+    def __init__(self, feeder: str) -> None:
+        super().__init__(f"no worker monitors feeder {feeder!r} at the moment; another one takes it over")

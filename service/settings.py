@@ -92,6 +92,7 @@ class Settings(BaseSettings):
     unsigned: Literal["refuse", "accept"] = "refuse"
     plaintext_network: bool = False
     notify: Path | None = None
+    workers: int | None = Field(default=None, ge=0, le=256)
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     log_format: Literal["console", "json"] = "console"
 

@@ -244,6 +244,10 @@ def access_control(plan: Plan, owners: Mapping[tuple[str, str], str]) -> dict[st
     }
 
 
+_CLUSTER = ("put", "query", "reply", "declare_subscriber", "declare_queryable")
+"""Messages between front and workers."""
+
+
 def _shared_rules(plan: Plan) -> list[dict[str, Any]]:
     # The service also receives what is published on a wrong key: it keeps it as a bad reading.
     prefix, everything = plan.prefix, f"{plan.prefix}/**"
@@ -251,6 +255,8 @@ def _shared_rules(plan: Plan) -> list[dict[str, Any]]:
     results = [f"{prefix}/*/{kind}" for kind in kinds]
     own = [f"{prefix}/{feeder}/{kind}" for feeder in sorted(plan.feeders) for kind in kinds]
     alive = [f"{prefix}/service/*"]
+    # Between front and workers; `**` above does not match them.
+    workers = [f"{prefix}/@worker/**"]
     asks = ["declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query"]
     tells = ["put", "delete", "reply", "declare_queryable", "liveliness_token"]
     return [
@@ -263,6 +269,8 @@ def _shared_rules(plan: Plan) -> list[dict[str, Any]]:
         _rule("service in readings", "ingress", ["declare_subscriber"], [everything]),
         _rule("service in token", "ingress", ["liveliness_token"], alive),
         _rule("service out", "egress", ["put", "delete", "query"], [everything]),
+        _rule("service in workers", "ingress", _CLUSTER, workers),
+        _rule("service out workers", "egress", _CLUSTER, workers),
     ]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Sequence
 from concurrent.futures import Future
 from typing import Annotated, Any, Protocol, TypeVar
 
@@ -20,6 +20,7 @@ from service.api.access import FRESH_S, Authenticator, authorise
 from service.engine.commissioning import CommissioningProgress
 from service.engine.operators import Operators
 from service.errors import FeederNotLoaded, FeederUnknown
+from service.report.feeder_info import Ownership
 from service.report.report import BUSBAR, FeederReport
 from service.store import Store
 
@@ -29,6 +30,20 @@ MAX_EVENT = (1 << 63) - 1
 """Largest number of an event."""
 NAME = r"^[A-Za-z0-9_-]{1,64}$"
 """Pattern of the names of feeders, meters and targets."""
+IDENTITY = "gridsec.identity"
+"""Entry of the ASGI scope with the identity of a request that the front of a cluster has authenticated."""
+
+
+class Answered(Exception):
+    """Ends a request with a response that another process of the cluster has made."""
+
+    def __init__(self, response: Response) -> None:
+        self.response = response
+        super().__init__(response.status_code)
+
+
+Forward = Callable[[Request, Identity, str, bytes], Awaitable[Response | None]]
+"""Forwards a request with identity, method and path template, and body; None: this process answers it."""
 
 
 class Backend(Protocol):
@@ -55,6 +70,12 @@ class Backend(Protocol):
 
     def summary(self, name: str) -> dict[str, Any]:
         """Return the numbers of a feeder in the list of feeders; empty before its first tick."""
+
+    async def latest(self, name: str) -> FeederReport | None:
+        """Return the latest report of a feeder as `report` does; it may be that of another process."""
+
+    def ownership(self, name: str) -> Ownership | None:
+        """Return the worker that monitors a feeder; None without workers."""
 
     def age(self, report: FeederReport) -> float:
         """Return the age of a feeder's latest report by the service's clock, s."""
@@ -147,17 +168,23 @@ def _backend(request: Request) -> Backend:
 
 
 async def authorised(request: Request) -> Identity:
-    """Identity of a request that may use its route."""
-    authenticator: Authenticator | None = request.app.state.authenticator
-    if authenticator is None:
-        return OPEN
+    """Identity of a request that may use its route. Raises Answered if another process has answered it."""
     route = f"{request.method} {request.scope['route'].path}"
     if POLICY.get(route, Role.ADMIN) is PUBLIC:
         return OPEN
+    forward: Forward | None = request.app.state.forward
+    authenticator: Authenticator | None = request.app.state.authenticator
+    identity: Identity = request.scope.get(IDENTITY, OPEN)
+    if authenticator is None and forward is None:
+        return identity
     body = b"" if request.method in {"GET", "HEAD"} else await request.body()
-    # Threads of their own: a slow database or issuer must not occupy those of the probes.
-    threads: CapacityLimiter = request.app.state.access_threads
-    return await to_thread.run_sync(authorise, authenticator, request, route, body, limiter=threads)
+    if authenticator is not None:
+        # Threads of their own: a slow database or issuer must not occupy those of the probes.
+        threads: CapacityLimiter = request.app.state.access_threads
+        identity = await to_thread.run_sync(authorise, authenticator, request, route, body, limiter=threads)
+    if forward is not None and (found := await forward(request, identity, route, body)) is not None:
+        raise Answered(found)
+    return identity
 
 
 class Permission:

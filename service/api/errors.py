@@ -22,7 +22,7 @@ from service.access.identity import IssuerUnavailable, NotAuthenticated, NotPerm
 from service.alarms.incidents import IncidentChanged, WrongTime
 from service.alarms.state_machine import AlreadyAcknowledged, NotAcknowledged, RaisedAgain
 from service.engine.commissioning import NothingToLearn
-from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, IdUnknown, TooManyFeeders
+from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, IdUnknown, NoOwner, TooManyFeeders
 from service.store import OutcomeUnknown, StoreUnavailable
 
 _log = structlog.get_logger("gridsec.http")
@@ -219,6 +219,7 @@ _STATUS: dict[type[GridsecError], int] = {
     IssuerUnavailable: 503,
     TooManyFailures: 429,
     FeederNotLoaded: 503,
+    NoOwner: 503,
     StoreUnavailable: 503,
     GridsecError: 500,
 }
@@ -233,6 +234,8 @@ def handlers() -> dict[type[Exception], Handler]:
 def _gridsec_handler(status: int) -> Handler:
     async def handler(request: Request, error: Exception) -> Response:
         more: dict[str, Any] = {}
+        if isinstance(error, NoOwner):
+            more["code"] = error.code
         if isinstance(error, FeederInvalid):
             more["problems"] = list(error.problems)
         if isinstance(error, OutcomeUnknown):

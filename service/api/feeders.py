@@ -125,7 +125,14 @@ def get_state(backend: BackendHere, report: Latest, response: Response) -> model
 
 
 def _state(backend: Backend, report: FeederReport) -> models.State:
-    return models.extended(models.State, report, age_s=backend.age(report))
+    owned = backend.ownership(report.feeder)
+    return models.extended(
+        models.State,
+        report,
+        age_s=backend.age(report),
+        owner=None if owned is None else owned.worker,
+        epoch=None if owned is None else owned.epoch,
+    )
 
 
 @router.get("/{feeder}/meters/{meter}")
@@ -289,7 +296,7 @@ async def stream_states(
     async for _ in wakes(backend):
         if not backend.known(feeder) or not await permission.lasts():
             return
-        report = backend.report(feeder)
+        report = await backend.latest(feeder)
         if report is not None and report is not last:
             last = report
             data = _STATE.dump_json(_state(backend, report)).decode()

@@ -74,6 +74,12 @@ class State(FeederReport):
     """A feeder at its latest tick."""
 
     age_s: Annotated[float, Field(description="Age of the tick at the response, by the service's clock, s.")]
+    owner: Annotated[
+        str | None, Field(description="Worker that monitors the feeder; null without workers.")
+    ] = None
+    epoch: Annotated[
+        int | None, Field(description="Number of its lease; it rises with every change of the owner.")
+    ] = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,7 +16,7 @@ from starlette.middleware.gzip import GZipMiddleware
 
 from service.api import alarms, feeders, guide, models, system
 from service.api.access import Authenticator
-from service.api.dependencies import Backend, authorised
+from service.api.dependencies import Answered, Backend, Forward, authorised
 from service.api.description import BODY, TAGS, feeder_schemas
 from service.api.errors import Guard, HeadAsGet, handlers, problem
 from service.notify.delivery import Notifier
@@ -41,11 +41,13 @@ def create_api(
     max_streams: int = MAX_STREAMS,
     authenticator: Authenticator | None = None,
     notifier: Notifier | None = None,
+    forward: Forward | None = None,
 ) -> FastAPI:
     """Return the HTTP application.
 
     `hosts` are host names for requests that change something, besides `localhost` and the machine's name.
-    Without an authenticator every request has the identity `OPEN`.
+    Without an authenticator every request has the identity `OPEN`, or that of its scope. `forward` passes
+    requests to other processes.
     """
     app = FastAPI(
         title="gridsec",
@@ -60,6 +62,7 @@ def create_api(
         dependencies=[Depends(authorised)],
     )
     app.state.authenticator, app.state.notifier = authenticator, notifier
+    app.state.forward = forward
     app.state.access_threads = CapacityLimiter(ACCESS_THREADS)
     app.state.backend = backend
     app.state.probe = system.Probe(backend.store, authenticator)
@@ -71,6 +74,7 @@ def create_api(
     for error, handler in handlers().items():
         app.add_exception_handler(error, handler)
     app.add_exception_handler(RequestValidationError, _validation_handler)
+    app.add_exception_handler(Answered, _answered_handler)
     for router in (feeders.router, *alarms.routers, *system.routers):
         app.include_router(router)
     app.add_route(guide.ADDRESS, guide.show, include_in_schema=False)
@@ -143,6 +147,10 @@ def _queries(schema: dict[str, Any]) -> dict[tuple[str, str], frozenset[str]]:
         for path, methods in schema["paths"].items()
         for method, operation in methods.items()
     }
+
+
+async def _answered_handler(_request: Request, error: Exception) -> Response:
+    return cast(Answered, error).response
 
 
 async def _validation_handler(request: Request, error: Exception) -> Response:

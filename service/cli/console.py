@@ -67,6 +67,7 @@ DATABASE: Final = 4
 ADDRESS: Final = 5
 FILE: Final = 6
 WRITER_LOST: Final = 7
+LEASE_LOST: Final = 8
 
 Feeder = Annotated[str, typer.Argument(help="A feeder's folder, or the name of one that comes with gridsec.")]
 Studied = Annotated[

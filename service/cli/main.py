@@ -46,6 +46,7 @@ from service.cli.console import (
     FAILED,
     FEEDER,
     FILE,
+    LEASE_LOST,
     USAGE,
     WRITER_LOST,
     Feeder,
@@ -122,6 +123,7 @@ app.command("zenoh-config")(pki.zenoh_config)
 app.command()(replay.replay)
 app.command()(reproduce.reproduce)
 app.command()(serve.serve)
+app.command()(serve.worker)
 
 
 def main() -> None:
@@ -147,6 +149,7 @@ def exit_code(error: GridsecError) -> int:
     from service.ingest.queues import BusUnavailable
     from service.settings import SettingsInvalid
     from service.store import StoreUnavailable, WriterLost
+    from service.store.schema import LeaseLost
 
     codes: dict[type[GridsecError], int] = {
         SettingsInvalid: USAGE,
@@ -155,6 +158,7 @@ def exit_code(error: GridsecError) -> int:
         DesignInfeasible: FEEDER,
         BusbarUnclear: FEEDER,
         WriterLost: WRITER_LOST,
+        LeaseLost: LEASE_LOST,
         StoreUnavailable: DATABASE,
         AddressUnavailable: ADDRESS,
         BusUnavailable: ADDRESS,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import sys
 import threading
 from functools import partial
@@ -12,12 +13,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.console import FAILED
+from service.cli.console import FAILED, LEASE_LOST, print_error
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Coroutine
 
     from service.app import Running
+    from service.settings import Settings
 
 Feeders = Annotated[list[str] | None, typer.Option(help="Folder or name of a feeder; may be repeated.")]
 EstimatorName = Annotated[
@@ -96,6 +98,17 @@ LogLevel = Annotated[str | None, typer.Option(help="debug, info, warning or erro
 LogFormat = Annotated[str | None, typer.Option(help="console or json. [default: console]")]
 STOP_S = 2.7
 """Time from a signal to the forced end, s; the documented limit is 3 s."""
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        min=0,
+        help="Monitor in this number of worker processes, with PostgreSQL; 0: by `gridsec worker` elsewhere. "
+        "[default: in this process]",
+    ),
+]
+WorkerName = Annotated[
+    str | None, typer.Option(help="Name of the worker, unique. [default: by host and process]")
+]
 UntilEof = Annotated[bool, typer.Option(hidden=True, help="End when standard input ends.")]
 
 
@@ -129,6 +142,7 @@ def serve(
     notify: Notify = None,
     log_level: LogLevel = None,
     log_format: LogFormat = None,
+    workers: Workers = None,
     until_eof: UntilEof = False,
 ) -> None:
     """Monitor feeders until interrupted. Every option can also be set as GRIDSEC_..., e.g. GRIDSEC_HTTP.
@@ -136,14 +150,7 @@ def serve(
     `--feeder` is GRIDSEC_FEEDERS, `--http-host` GRIDSEC_HTTP_HOSTS, `--max-skew` GRIDSEC_MAX_SKEW_S and
     `--grace` GRIDSEC_GRACE_S.
     """
-    import structlog
-
-    from service import logs
-    from service.app import serve as run
-    from service.engine.design_jobs import abandon, settle
-    from service.ingest import zenoh_bus
-    from service.ingest.queues import BusConfig
-    from service.settings import refuse_exposed, settings, strangers
+    from service.settings import settings
 
     chosen = settings(
         {
@@ -175,28 +182,146 @@ def serve(
             "notify": notify,
             "log_level": log_level,
             "log_format": log_format,
+            "workers": workers,
         }
     )
+    _prepare(chosen, chosen.listen)
+    _serve(chosen, until_eof=until_eof)
+
+
+def worker(
+    *,
+    name: WorkerName = None,
+    zenoh_listen: Listen = None,
+    zenoh_connect: Endpoints = None,
+    zenoh_mode: Mode = None,
+    zenoh_config: Config = None,
+    prefix: Prefix = None,
+    database: Database = None,
+    max_skew: MaxSkew = None,
+    grace: Grace = None,
+    max_payload: MaxPayload = None,
+    queue: Queue = None,
+    max_shelve: MaxShelve = None,
+    meter_keys: MeterKeysFile = None,
+    unsigned: Unsigned = None,
+    plaintext_network: Plaintext = False,
+    log_level: LogLevel = None,
+    log_format: LogFormat = None,
+    until_eof: UntilEof = False,
+) -> None:
+    """Monitor a part of the feeders of a cluster until interrupted.
+
+    The front is `gridsec serve --workers`. Both have the same PostgreSQL database, zenoh network and prefix.
+    Every option but `--name` can also be set as GRIDSEC_..., as for `serve`. By default zenoh connects to
+    tcp/127.0.0.1:7447 as a client.
+    """
+    from service.settings import DEFAULT_ENDPOINT, settings
+
+    chosen = settings(
+        {
+            "zenoh_listen": tuple(zenoh_listen) if zenoh_listen else None,
+            "zenoh_connect": tuple(zenoh_connect) if zenoh_connect else None,
+            "zenoh_mode": zenoh_mode,
+            "zenoh_config": zenoh_config,
+            "prefix": prefix,
+            "database": database,
+            "max_skew_s": max_skew,
+            "grace_s": grace,
+            "max_payload": max_payload,
+            "queue": queue,
+            "max_shelve_h": max_shelve,
+            "meter_keys": meter_keys,
+            "unsigned": unsigned,
+            "plaintext_network": plaintext_network or None,
+            "log_level": log_level,
+            "log_format": log_format,
+        }
+    )
+    if not (chosen.zenoh_connect or chosen.zenoh_listen or chosen.zenoh_config):
+        chosen = chosen.model_copy(update={"zenoh_connect": (DEFAULT_ENDPOINT,)})
+    if chosen.zenoh_mode is None and chosen.zenoh_config is None:
+        chosen = chosen.model_copy(update={"zenoh_mode": "client"})
+    _prepare(chosen, chosen.zenoh_listen)
+    _work(chosen, name, until_eof=until_eof)
+
+
+def _prepare(chosen: Settings, listen: tuple[str, ...]) -> None:
+    """Refuse endpoints of zenoh without TLS, and set up the log. Raises SettingsInvalid."""
+    import structlog
+
+    from service import logs
+    from service.ingest import zenoh_bus
+    from service.ingest.queues import BusConfig
+    from service.settings import refuse_exposed, strangers
+
     if not chosen.plaintext_network:
-        bus = BusConfig(chosen.zenoh_mode, chosen.listen, chosen.zenoh_connect, chosen.zenoh_config)
+        bus = BusConfig(chosen.zenoh_mode, listen, chosen.zenoh_connect, chosen.zenoh_config)
         refuse_exposed(zenoh_bus.endpoints(bus))
     logs.set_up(chosen.log_level, chosen.log_format)
     for variable, closest in strangers(os.environ).items():
         structlog.get_logger().warning("variable_ignored", variable=variable, closest=closest or None)
 
+
+def _serve(chosen: Settings, *, until_eof: bool) -> None:
+    """Run the service, or the front of a cluster."""
+    import structlog
+
+    from service.app import serve as run
+    from service.cluster.run import serve_front
+    from service.engine.design_jobs import settle
+
     def announce(running: Running) -> None:
         print(running.url, flush=True)
-        if not running.feeders:
+        if not running.feeders and chosen.workers is None:
             structlog.get_logger("gridsec.app").warning(
                 "no feeder is monitored", add=f"--feeder DIR, or PUT {running.url}/api/v1/feeders/NAME"
             )
         if until_eof:
             _stop_at_eof(asyncio.get_running_loop(), running.stop)
 
+    if chosen.workers is None:
+        _run_to_end(lambda stopping: run(chosen, announce=announce, settled=settle, stopping=stopping))
+    else:
+        _run_to_end(lambda stopping: serve_front(chosen, announce=announce, stopping=stopping))
+
+
+def _work(chosen: Settings, name: str | None, *, until_eof: bool) -> None:
+    """Run a worker."""
+    from service.api.dependencies import NAME
+    from service.cluster.run import check_cluster
+    from service.cluster.worker import work, worker_name
+    from service.engine.design_jobs import settle
+
+    check_cluster(chosen)
+    if name is not None and re.fullmatch(NAME, name) is None:
+        raise typer.BadParameter(f"--name {name!r}: expected 1 to 64 of the characters A-Z a-z 0-9 _ -")
+
+    def announce(stop: Callable[[], None]) -> None:
+        if until_eof:
+            _stop_at_eof(asyncio.get_running_loop(), stop)
+
+    chosen_name = name or worker_name()
+    _run_to_end(
+        lambda stopping: work(
+            chosen, chosen_name, announce=announce, settled=settle, stopping=stopping, lost=_end_now
+        )
+    )
+
+
+def _end_now(error: BaseException) -> None:
+    """End the process after the loss of a lease, before anything is written or published."""
+    print_error(str(error))
+    os._exit(LEASE_LOST)
+
+
+def _run_to_end(main: Callable[[Callable[[], None]], Coroutine[None, None, None]]) -> None:
+    """Run a service; `main` gets what it calls when it begins to end."""
+    from service.engine.design_jobs import abandon
+
     ended = threading.Event()
     try:
-        stopping = partial(_end_within, STOP_S, ended)
-        asyncio.run(run(chosen, announce=announce, settled=settle, stopping=stopping))
+        asyncio.run(main(partial(_end_within, STOP_S, ended)))
         ended.set()
     finally:
         abandon()

@@ -28,7 +28,7 @@ import structlog
 from feeders.model.site import Site
 from gridsec.errors import GridsecError
 from service.access.signing import MeterKeys
-from service.alarms.incidents import event_json
+from service.alarms.incidents import IncidentEvent, event_json
 from service.alarms.state_machine import (
     Alarm,
     AlarmRules,
@@ -49,10 +49,11 @@ from service.ingest.decode import Wire
 from service.ingest.queues import Inbox, Sample
 from service.ingest.reading import BadReading, BadReason, Reading, Readings, head_of
 from service.metrics import Metrics
+from service.report.feeder_info import Ownership
 from service.report.report import BUSBAR, FeederReport
 from service.report.tick_state import TickState
 from service.store import Rejected, Store
-from service.store.committer import Committer, Executor, Wish, alarm_key, incident_key, inline
+from service.store.committer import Committer, Executor, Publisher, Wish, alarm_key, incident_key, inline
 from service.store.schema import CommissioningEvent
 from service.store.series import Mark, mark, worth_keeping
 from service.store.state_codec import KeptInvalid, StateSnapshot, decode_signed, encode_signed
@@ -198,6 +199,18 @@ class RuntimeConfig:
     max_feeders: int = 100  # largest number of feeders added at run time, besides those given at the start
     shelve_most_s: float = SHELVE_MOST_S  # longest time of a shelf, s
     meter_keys: MeterKeys | None = None  # keys of meters; None accepts readings without signature
+    # Worker and lease of a feeder; None without workers.
+    ownership: Callable[[str], Ownership | None] = lambda _: None
+    # False while the leases of this process may have expired: it must not act.
+    acts: Callable[[], bool] = lambda: True
+
+
+@dataclass(frozen=True, slots=True)
+class Handover:
+    """State of a feeder for its next owner, as stored."""
+
+    state: PersistedState
+    open_incidents: tuple[IncidentEvent, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -360,16 +373,83 @@ class Engine:
         return answer
 
     def _removed(self, name: str) -> None:
+        self.committer.waiting.forget(name)
+        self._drop(name)
+
+    def _drop(self, name: str) -> None:
+        """Forget a feeder; what waits for the database is stored."""
         self.unloaded.pop(name, None)
         self.monitors = {other: kept for other, kept in self.monitors.items() if other != name}
-        self._wakes.pop(name, None)
-        self._marks.pop(name, None)
-        self.load.feeders.pop(name, None)
-        self.committer.waiting.forget(name)
+        for table in (self._wakes, self._marks, self.reported, self.load.feeders):
+            table.pop(name, None)
         self._learn()
         self.metrics.forget(name)
         if self.committer.publisher is not None:
             self.committer.publisher.withdraw(f"{name}/estimate")
+
+    # ---------------------------------------------------------------- feeders of a worker
+
+    def adopt(
+        self, sites: Sequence[Site], installed: Callable[[FeederMonitor], None]
+    ) -> Future[list[FeederMonitor]]:
+        """Go on with feeders of another owner: their state and standing alarms.
+
+        `installed` is called with each monitor. Raises StoreUnavailable if the database cannot be read; no
+        feeder is taken over then.
+        """
+        answer: Future[list[FeederMonitor]] = Future()
+
+        def take(found: Sequence[Handover]) -> None:
+            made = []
+            for site, handover in zip(sites, found, strict=True):
+                made.append(self.add(site, handover.state))
+                self._take_over(handover)
+                installed(made[-1])
+            self.committer.commit()
+            answer.set_result(made)
+
+        def read(db: Store) -> list[Handover]:
+            return [self._handover(site.feeder.name, db) for site in sites]
+
+        self.committer.look(read, _then(answer, take), partial(_refuse, answer))
+        return answer
+
+    def _handover(self, name: str, store: Store) -> Handover:
+        return Handover(
+            self._past(name, store),
+            tuple(store.open_incident_events(feeder=name)),
+        )
+
+    def _take_over(self, handover: Handover) -> None:
+        """Set the replies for standing alarms and incidents."""
+        publisher = self.committer.publisher
+        if publisher is not None:
+            for alarm in (one for one in handover.state.alarms if one.active):
+                publisher.answer(alarm_key(alarm), msgspec.json.encode(alarm_json(alarm)))
+            for event in handover.open_incidents:
+                publisher.answer(incident_key(event.incident), msgspec.json.encode(event_json(event)))
+
+    def resign(self, names: Collection[str]) -> Future[None]:
+        """End the monitoring of feeders for their next owner: their state is stored, their alarms stay.
+
+        Raises StoreUnavailable if the database is known to be unavailable; monitoring then continues.
+        """
+        answer: Future[None] = Future()
+        leaving = [self.monitors[name] for name in names if name in self.monitors]
+        self.keep_states(leaving, at_once=True)
+        landed = _landing(answer, lambda: None)
+        self.committer.look(lambda _: None, lambda _: landed(), partial(_refuse, answer))
+        for monitor in leaving:
+            if self.committer.publisher is not None:
+                self._withdraw(self.committer.publisher, monitor)
+            self._drop(monitor.name)
+        return answer
+
+    @staticmethod
+    def _withdraw(publisher: Publisher, monitor: FeederMonitor) -> None:
+        """Remove the replies to queries for a feeder: its next owner has newer ones."""
+        for alarm in monitor.book.active:
+            publisher.withdraw(alarm_key(alarm))
 
     def _learn(self) -> None:
         known = {name: known_of(monitor.site) for name, monitor in self.monitors.items()}
@@ -617,10 +697,13 @@ class Engine:
     # ---------------------------------------------------------------- publishing
 
     def _publish_estimates(self, results: list[TickResult]) -> None:
-        if self.committer.publisher is None:
+        if self.committer.publisher is None or not self.config.acts():
             return
         for result in results:
-            self.committer.publisher.telemetry(f"{result.state.feeder}/estimate", result.state.text)
+            name = result.state.feeder
+            owned = self.config.ownership(name)
+            text = result.state.text if owned is None else partial(_stamped, result.state, owned)
+            self.committer.publisher.telemetry(f"{name}/estimate", text)
         self.metrics.count_bus(self.committer.publisher.counts)
 
     # ---------------------------------------------------------------- operators
@@ -707,6 +790,12 @@ class Engine:
         wish = Wish(kept=kept, happened=wanted)
         self.committer.store(wish, _landing(answer, landed), partial(_refuse, answer))
         return answer
+
+
+def _stamped(state: TickState, owned: Ownership) -> bytes:
+    """Report as JSON text, with its owner and epoch."""
+    owner = msgspec.json.encode({"owner": owned.worker, "epoch": owned.epoch})
+    return state.text().rstrip()[:-1] + b"," + owner[1:]
 
 
 def _then(answer: Future[Any], store: Callable[[T], None]) -> Callable[[T], None]:

@@ -12,7 +12,7 @@ import asyncio
 import contextlib
 import time
 from collections import deque
-from collections.abc import AsyncGenerator, Callable, Iterable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any, TypeVar
@@ -33,6 +33,7 @@ from service.ingest.align import Clock
 from service.ingest.queues import Inbox, Sample
 from service.metrics import Metrics
 from service.report import feeder_info
+from service.report.feeder_info import Ownership
 from service.report.report import FeederReport
 from service.report.tick_state import TickState
 from service.store import OutcomeUnknown, Store, StoreUnavailable
@@ -86,7 +87,7 @@ class Runtime:
             stored=lambda: self._in_loop(partial(self._notify, "alarm")),
             apart=self._write_apart,
             unloaded=unloaded,
-            go_on=lambda: not self._stopping,
+            go_on=lambda: not self._stopping and config.acts(),
         )
         # With `Clock.EVENTS` samples wait for ticks and for the database.
         self._waits = config.clock is Clock.EVENTS
@@ -138,9 +139,12 @@ class Runtime:
         try:
             await self._loop.run_in_executor(self._writer, self._engine.begin, self._given)
             for monitor in self._engine.monitors.values():
-                design_jobs.begin(monitor, lambda install: self._in_loop(partial(self._hand_over, install)))
+                self._design(monitor)
             while not self._stopping:
                 self._check_writer()
+                if not self._engine.config.acts():
+                    await asyncio.sleep(GATHER_S)
+                    continue
                 await self._execute_commands()
                 news = await self._in_worker(self._round)
                 self._last_round = time.monotonic()
@@ -160,6 +164,9 @@ class Runtime:
                 answer.cancel()
             self._worker.shutdown(wait=False)
             self._writer.shutdown(wait=False)
+
+    def _design(self, monitor: FeederMonitor) -> None:
+        design_jobs.begin(monitor, lambda install: self._in_loop(partial(self._hand_over, install)))
 
     def _round(self) -> bool:
         news = self._engine.cycle(self._samples(), self._inbox.oldest)
@@ -363,6 +370,14 @@ class Runtime:
         monitor = self._engine.monitors.get(name)
         return None if monitor is None else monitor.report
 
+    async def latest(self, name: str) -> FeederReport | None:
+        """Return a feeder's latest report, or None."""
+        return self.report(name)
+
+    def ownership(self, name: str) -> Ownership | None:
+        """Return the worker that monitors a feeder: this process, or None without workers."""
+        return self._engine.config.ownership(name)
+
     def summary(self, name: str) -> dict[str, Any]:
         """Return the numbers of a feeder in the list of feeders; empty before its first tick."""
         monitor = self._engine.monitors.get(name)
@@ -453,6 +468,22 @@ class Runtime:
             return self._engine.put(site, tables, installed)
 
         await self._command(put)
+
+    async def adopt(self, sites: Sequence[Site]) -> None:
+        """Go on with feeders of another process as `Engine.adopt` does; their designs follow."""
+        await self._command(partial(self._engine.adopt, sites, self._design))
+        self._notify("state")
+
+    async def resign(self, names: Collection[str]) -> None:
+        """End the monitoring of feeders as `Engine.resign` does; their state is stored when this returns."""
+        await self._command(partial(self._engine.resign, names))
+        for name in names:
+            self._inbox.forget(name)
+        self._notify("state")
+
+    def set_unloaded(self, reasons: Mapping[str, str]) -> None:
+        """Note the feeders of this process that cannot be loaded, with the reasons."""
+        self._engine.unloaded = dict(reasons)
 
     def _make_room(self, name: str) -> None:
         """Check the limit of feeders before one more is added."""

@@ -143,7 +143,8 @@ class Bus:
         real time old data are worthless.
     wall: wall clock, Unix s.
     missed: called with `alarm` or `incident`, a number and a limit; returns the stored events after the
-        number, oldest first. A GridsecError that it raises is the reply.
+        number, oldest first. A GridsecError that it raises is the reply. None: such queries get no reply.
+    everything: subscribe to all keys below the prefix. Otherwise `follow` subscribes to single feeders.
     """
 
     def __init__(
@@ -155,9 +156,12 @@ class Bus:
         max_payload: int,
         lossless: bool,
         wall: Callable[[], float] = time.time,
-        missed: Callable[[str, int, int], Iterable[StoredEvent]] = lambda *_: (),
+        missed: Callable[[str, int, int], Iterable[StoredEvent]] | None = lambda *_: (),
+        everything: bool = True,
     ) -> None:
-        self._wall, self._missed = wall, missed
+        self._wall, self._missed, self._everything = wall, missed, everything
+        self._live: zenoh.Session | None = None
+        self._followed: dict[str, zenoh.Subscriber[Any]] = {}
         self._config = config
         self._prefix = prefix
         self._deliver = deliver
@@ -174,17 +178,11 @@ class Bus:
     def __enter__(self) -> Bus:
         """Open the session, subscribe, and declare the queryables."""
         with ExitStack() as stack:
-            live = stack.enter_context(session(self._config))
-            # A full ring drops the oldest samples; the gap shows in the sequence numbers.
-            ring: Any = (
-                zenoh.handlers.FifoChannel(RING) if self._lossless else zenoh.handlers.RingChannel(RING)
-            )
-            # One subscription for all kinds of readings keeps their order. Its pattern also matches wrong
-            # keys: they are reported as bad readings.
-            remote = zenoh.Locality.REMOTE
-            subscriber = live.declare_subscriber(f"{self._prefix}/**", ring, allowed_origin=remote)
-            stack.callback(subscriber.undeclare)
-            self._start("zenoh readings", self._receive, subscriber.handler)
+            live = self._live = stack.enter_context(session(self._config))
+            if self._everything:
+                # Its pattern also matches wrong keys: they are reported as bad readings.
+                subscriber = self._subscribe(live, "**")
+                stack.callback(subscriber.undeclare)
             for kind in ("estimate", "alarm/*", "incident/*"):
                 key = f"{self._prefix}/*/{kind}"
                 queryable = live.declare_queryable(key, zenoh.handlers.FifoChannel(QUERIES_WAITING))
@@ -210,7 +208,31 @@ class Bus:
         self._threads.append(thread)
         return thread
 
+    def _session(self) -> zenoh.Session:
+        if self._live is None:
+            raise BusUnavailable("the zenoh session is not open", code="bus-closed")
+        return self._live
+
     # ---------------------------------------------------------------- in
+
+    def _subscribe(self, live: zenoh.Session, pattern: str) -> zenoh.Subscriber[Any]:
+        """Subscribe to readings; one subscription for all kinds of readings keeps their order."""
+        # A full ring drops the oldest samples; the gap shows in the sequence numbers.
+        ring: Any = zenoh.handlers.FifoChannel(RING) if self._lossless else zenoh.handlers.RingChannel(RING)
+        remote = zenoh.Locality.REMOTE
+        made = live.declare_subscriber(f"{self._prefix}/{pattern}", ring, allowed_origin=remote)
+        self._start(f"zenoh {pattern}", self._receive, made.handler)
+        return made
+
+    def follow(self, feeder: str) -> None:
+        """Subscribe to the keys of one feeder; idempotent."""
+        if feeder not in self._followed:
+            self._followed[feeder] = self._subscribe(self._session(), f"{feeder}/**")
+
+    def unfollow(self, feeder: str) -> None:
+        """End the subscription of `follow`; idempotent."""
+        if (made := self._followed.pop(feeder, None)) is not None:
+            made.undeclare()  # type: ignore[no-untyped-call]
 
     def _receive(self, handler: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         while True:
@@ -346,7 +368,8 @@ class Bus:
             self.counts.queries += 1
             with query:
                 if kind != "estimate" and query.parameters.get("after") is not None:
-                    self._answer_missed(kind, query)
+                    if self._missed is not None:
+                        self._answer_missed(kind, query, self._missed)
                     continue
                 with self._answers_lock:
                     known = tuple(self._answers.items())
@@ -356,14 +379,16 @@ class Bus:
                     if not _reply(query, key, text):
                         break
 
-    def _answer_missed(self, kind: str, query: zenoh.Query) -> None:
+    def _answer_missed(
+        self, kind: str, query: zenoh.Query, missed: Callable[[str, int, int], Iterable[StoredEvent]]
+    ) -> None:
         """Reply with the newest event of each key after the number of a query; numbers are attachments."""
         given = query.parameters.get("after") or ""
         if not (given.isascii() and given.isdigit() and len(given) <= _DIGITS):
             _refuse(query, f"after is {given[:40]!r}; expected the number of an event")
             return
         try:
-            events = list(self._missed(kind, int(given), MISSED_AT_ONCE))
+            events = list(missed(kind, int(given), MISSED_AT_ONCE))
         except GridsecError as error:
             _refuse(query, str(error))
             return
@@ -372,6 +397,65 @@ class Bus:
             key = f"{self._prefix}/{event.key}"
             if query.key_expr.intersects(key) and not _reply(query, key, event.payload, event.number):
                 return
+
+    # ---------------------------------------------------------------- between processes of a cluster
+
+    def serve(self, key: str, answer: Callable[[bytes, Callable[[bytes], None]], None]) -> None:
+        """Answer queries for a key, without the prefix.
+
+        `answer` is called from another thread with the payload and a function that replies, once, from any
+        thread.
+        """
+        live = self._session()
+        made = live.declare_queryable(f"{self._prefix}/{key}", zenoh.handlers.FifoChannel(QUERIES_WAITING))
+        self._stack.callback(made.undeclare)
+        self._start(f"zenoh {key}", partial(_serve, answer), made.handler)
+
+    def ask(self, key: str, payload: bytes, timeout_s: float) -> list[bytes]:
+        """Query a key, without the prefix; return the payloads of the replies. Blocks."""
+        try:
+            replies = self._session().get(f"{self._prefix}/{key}", payload=payload, timeout=timeout_s)
+            return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+        except zenoh.ZError as error:
+            raise BusUnavailable(f"zenoh query: {_first_line(error)}", code="query-failed") from error
+
+    def hear(self, key: str, take: Callable[[bytes], None]) -> None:
+        """Call `take` from another thread with each payload that is put on a key, without the prefix."""
+        made = self._session().declare_subscriber(f"{self._prefix}/{key}", zenoh.handlers.RingChannel(RING))
+        self._stack.callback(made.undeclare)
+        self._start(f"zenoh {key}", partial(_hear, take), made.handler)
+
+    def tell(self, key: str, payload: bytes) -> None:
+        """Publish a value without a stored reply; under congestion it is dropped. `key` has no prefix."""
+        self._outgoing.add_telemetry(f"{self._prefix}/{key}", payload)
+
+
+def _serve(
+    answer: Callable[[bytes, Callable[[bytes], None]], None], handler: zenoh.handlers.Handler[zenoh.Query]
+) -> None:
+    while True:
+        try:
+            query = handler.recv()
+        except zenoh.ZError:
+            return
+        given = query.payload
+        answer(b"" if given is None else given.to_bytes(), partial(_respond, query))
+
+
+def _respond(query: zenoh.Query, payload: bytes) -> None:
+    """Reply on the key of the query, and end it."""
+    with suppress(zenoh.ZError), query:  # the querying session is closed
+        query.reply(query.key_expr, payload)
+
+
+def _hear(take: Callable[[bytes], None], handler: zenoh.handlers.Handler[zenoh.Sample]) -> None:
+    while True:
+        try:
+            sample = handler.recv()
+        except zenoh.ZError:
+            return
+        if sample.kind == zenoh.SampleKind.PUT:
+            take(sample.payload.to_bytes())
 
 
 def _has_receiver(publisher: zenoh.Publisher) -> bool:

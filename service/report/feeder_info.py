@@ -5,12 +5,21 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
 from feeders.format.tables import to_json
 from feeders.model.site import Site
 from service.report.report import BUSBAR, FeederReport
+
+
+@dataclass(frozen=True, slots=True)
+class Ownership:
+    """Worker that monitors a feeder, and the epoch of its lease."""
+
+    worker: str
+    epoch: int
 
 
 class FeederStatus(StrEnum):

@@ -401,10 +401,12 @@ class IncidentReader:
         with self._read() as connection:
             return [_event(row) for row in connection.execute(query).mappings()]
 
-    def open_incident_events(self) -> list[IncidentEvent]:
-        """Return the newest event of each open incident."""
+    def open_incident_events(self, *, feeder: str | None = None) -> list[IncidentEvent]:
+        """Return the newest event of each open incident, of one feeder or (None) of all."""
         e, i = INCIDENT_EVENT.c, INCIDENT.c
         open_ones = sa.select(i.id).where(i.state != str(IncidentState.CLEARED))
+        if feeder is not None:
+            open_ones = open_ones.where(i.feeder == feeder)
         newest = sa.select(sa.func.max(e.seq)).where(e.incident_id.in_(open_ones)).group_by(e.incident_id)
         with self._read() as connection:
             rows = connection.execute(sa.select(INCIDENT_EVENT).where(e.seq.in_(newest)).order_by(e.seq))

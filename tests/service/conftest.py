@@ -253,6 +253,12 @@ class SmallService:
     def report(self, name: str) -> FeederReport | None:
         return self.reports.get(name)
 
+    async def latest(self, name: str) -> FeederReport | None:
+        return self.report(name)
+
+    def ownership(self, _: str) -> None:
+        return None
+
     def age(self, report: FeederReport) -> float:
         return self.delay_s + time.monotonic() - self.heard[report.feeder]
 

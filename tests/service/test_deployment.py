@@ -24,7 +24,7 @@ from service.settings import Settings, strangers
 from tests.service.running import FEEDER, free_port
 
 ROOT = Path(__file__).parents[2]
-UNIT = ROOT / "deploy" / "gridsec.service"
+UNITS = sorted((ROOT / "deploy").glob("*.service"))
 CONTAINER = ROOT / "deploy" / "Containerfile"
 ENVIRONMENT = {k: v for k, v in os.environ.items() if not k.startswith("GRIDSEC_")}
 # PR_SET_MDWE of Linux 6.3: no writable and executable memory, as MemoryDenyWriteExecute of the unit.
@@ -103,10 +103,13 @@ def test_messages_without_systemd_are_dropped(tmp_path: Path, monkeypatch: pytes
 # ------------------------------------------------------------------------ unit
 
 
-def unit() -> dict[str, dict[str, list[str]]]:
-    """Values of each key of the unit, by section."""
+units = pytest.mark.parametrize("path", UNITS, ids=lambda path: path.stem)
+
+
+def unit(path: Path) -> dict[str, dict[str, list[str]]]:
+    """Values of each key of a unit, by section."""
     out: dict[str, dict[str, list[str]]] = {}
-    for line in UNIT.read_text().splitlines():
+    for line in path.read_text().splitlines():
         if line.startswith("["):
             section = out.setdefault(line.strip("[]"), {})
         elif line and not line.startswith("#"):
@@ -127,12 +130,13 @@ def known(variables: list[str]) -> None:
     assert strangers(dict.fromkeys(variables, "")) == {}
 
 
-def test_the_unit_starts_the_service_with_known_settings() -> None:
-    service = unit()["Service"]
+@units
+def test_the_unit_starts_the_service_with_known_settings(path: Path) -> None:
+    service = unit(path)["Service"]
     (start,) = service["ExecStart"]
     program, command, *options = shlex.split(start)
     assert (Path(program).name, command in commands()) == ("gridsec", True)
-    fields = Settings.model_fields
+    fields = {*Settings.model_fields, "name"}
     assert all(each[2:].replace("-", "_") in fields for each in options if each.startswith("--"))
     known([each.partition("=")[0] for each in service["Environment"]])
     assert (service["Type"], service["WatchdogSec"]) == (["notify"], ["30"])
@@ -141,13 +145,14 @@ def test_the_unit_starts_the_service_with_known_settings() -> None:
     assert all(service[name] == ["yes"] for name in hardened)
 
 
-def test_systemd_verifies_the_unit(tmp_path: Path) -> None:
-    assert set(unit()) == {"Unit", "Service", "Install"}
+@units
+def test_systemd_verifies_the_unit(path: Path, tmp_path: Path) -> None:
+    assert set(unit(path)) == {"Unit", "Service", "Install"}
     analyze = shutil.which("systemd-analyze")
     if analyze is None:  # another system: the parts above are checked all the same
         return
-    copy = tmp_path / UNIT.name
-    copy.write_text(UNIT.read_text().replace("/opt/gridsec/bin/gridsec", "/bin/true"))
+    copy = tmp_path / path.name.replace("@", "@1")
+    copy.write_text(path.read_text().replace("/opt/gridsec/bin/gridsec", "/bin/true"))
     done = subprocess.run(
         [analyze, "verify", "--man=no", copy], capture_output=True, text=True, timeout=60, check=False
     )

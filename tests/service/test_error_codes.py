@@ -52,15 +52,17 @@ from service.cli.paths import check_paths, write_tables
 from service.cli.replay import _site_of
 from service.cli.sources import converted
 from service.cli.study_report import STUDIES, Asked
+from service.cluster.envelope import Envelope
+from service.cluster.run import check_cluster
 from service.engine.commissioning import FeederCommissioning
 from service.engine.design_jobs import prepare
 from service.engine.operators import Operators, ShelfRequest
 from service.engine.runtime import Runtime
-from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, TooManyFeeders
+from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, NoOwner, TooManyFeeders
 from service.ingest import zenoh_bus
 from service.ingest.align import AlignRules
 from service.ingest.queues import BusConfig
-from service.ingest.zenoh_bus import MeterClient
+from service.ingest.zenoh_bus import Bus, MeterClient
 from service.notify.post import permitted
 from service.notify.targets import read_targets
 from service.settings import refuse_exposed, settings
@@ -362,6 +364,15 @@ def put_fails(_: Path, __: Patch) -> None:
     meters.put("key", b"")
 
 
+def query_fails(_: Path, __: Patch) -> None:
+    def get(*_: object, **__: object) -> None:
+        raise zenoh.ZError("the session is closed at /there")
+
+    bus = Bus(BusConfig(), "gridsec", lambda _: None, max_payload=1, lossless=False)
+    bus._live = cast(Any, SimpleNamespace(get=get))
+    bus.ask("key", b"", 1.0)
+
+
 def wrong_targets(place: Path, _: Patch) -> None:
     path = place / "targets.toml"
     hook = '[[webhook]]\nname = "a"\nurl = '
@@ -551,6 +562,11 @@ CALLS: dict[str, Call] = {
     "stored feeder that cannot be loaded": lambda _, __: refuse(
         FeederNotLoaded("village", "meters.csv: missing")
     ),
+    "feeder without a worker": lambda _, __: refuse(NoOwner("village")),
+    "message of another cluster": lambda _, __: Envelope(b"ours").open(
+        "call", Envelope(b"theirs").seal("call", {})
+    ),
+    "workers without PostgreSQL": lambda _, __: check_cluster(settings({"clock": "events"})),
     "feeder of the command line": lambda _, __: refuse(FeederFixed("village")),
     "invalid API key": lambda place, _: authenticator(place).of_credential("gridsec_0_0", "127.0.0.1"),
     "many invalid API keys": lambda place, _: many_invalid_keys(authenticator(place)),
@@ -588,6 +604,7 @@ CALLS: dict[str, Call] = {
     "zenoh endpoint": no_bus,
     "zenoh session that is closed": lambda _, __: MeterClient(BusConfig(), "gridsec").put("key", b""),
     "put that fails": put_fails,
+    "query that fails": query_fails,
     "stored state of another format": damaged({'"format":': '"format":9'}),
     "stored state of another feeder": damaged({'"feeder":"cigre-lv"': '"feeder":"town"'}),
     "stored state with another field": damaged({'"format":': '"more":1,"format":'}),

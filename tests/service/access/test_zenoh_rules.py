@@ -123,6 +123,26 @@ def test_a_declared_publisher_reaches_the_service(network: Network) -> None:
         until(arrived)
 
 
+def test_processes_of_a_cluster_reach_each_other_and_no_other_client_does(network: Network) -> None:
+    config = BusConfig(None, file=network.folder / "service.json5")
+    front = Bus(config, "gridsec", lambda _: None, max_payload=1000, lossless=False, everything=False)
+    with front, network.client("c1") as meters:
+        heard: list[bytes] = []
+        network.bus.serve("@worker/w0/rest", lambda payload, respond: respond(payload))
+        front.hear("@worker/*/state", heard.append)
+
+        def reached() -> bool:
+            network.bus.tell("@worker/w0/state", b"state")
+            return b"state" in heard and front.ask("@worker/w0/rest", b"call", 2.0) == [b"call"]
+
+        until(reached)
+        replies = meters.get("gridsec/@worker/w0/rest", payload=b"call", timeout=1.0)
+        assert [one.ok for one in replies if one.ok is not None] == []
+        meters.put("gridsec/@worker/w0/state", b"forged")
+        time.sleep(0.3)
+        assert b"forged" not in heard
+
+
 def test_the_service_alone_publishes_estimates_and_alarms(network: Network) -> None:
     with network.client("scada") as scada, network.client("c1") as c1, network.client("c2") as reader:
         keys = ("gridsec/town/estimate", "gridsec/town/alarm/a1")

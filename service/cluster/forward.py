@@ -1,0 +1,235 @@
+"""Forwarding of requests from the front to the owner of a feeder.
+
+A request with a feeder in its path goes to the owner of this feeder. A command on an alarm, incident, shelf
+or planned work goes to the owner of its feeder. All other requests are answered by the front.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from typing import Any, Final
+
+from anyio import CapacityLimiter, to_thread
+from starlette.requests import Request
+from starlette.responses import Response
+
+from gridsec.errors import GridsecError
+from service.access.identity import OPEN, Identity
+from service.alarms.state_machine import AlarmUnknown
+from service.cluster.envelope import Envelope
+from service.cluster.rest import FORWARDED, Answer, Call, rest_key
+from service.cluster.workers import Workers
+from service.errors import FeederFixed, NoOwner, TooManyFeeders
+from service.ingest.queues import BusUnavailable
+from service.store import OutcomeUnknown
+from service.store.store import Reader
+
+ANSWER_S: Final = 15.0
+"""Time limit of an answer, s: above the time limit of a command with the database."""
+DESIGN_S: Final = 600.0
+"""Time limit of an answer to new tables of a feeder, s: the owner designs its monitor."""
+FORWARDS: Final = 64
+"""Largest number of requests that wait for workers at a time."""
+_BULK: Final = "POST /api/v1/alarms/ack"
+_FEEDER: Final = "/api/v1/feeders/{feeder}"
+
+Ask = Callable[[str, bytes, float], list[bytes]]
+"""Queries a key as `Bus.ask` does."""
+
+
+class Forwarder:
+    """Forwards requests of the front.
+
+    workers: the heard workers.
+    store: database, to find the feeder of an alarm.
+    given: feeders of the command line, which REST cannot delete.
+    names: names of all feeders.
+    refresh: reads them again, after one was put or deleted.
+    max_feeders: largest number of feeders added over REST.
+    """
+
+    def __init__(
+        self,
+        workers: Workers,
+        store: Reader,
+        ask: Ask,
+        envelope: Envelope,
+        *,
+        names: Callable[[], Mapping[str, Any]],
+        refresh: Callable[[], Awaitable[None]],
+        given: frozenset[str] = frozenset(),
+        max_feeders: int = 100,
+    ) -> None:
+        self._workers, self._store, self._ask, self._envelope = workers, store, ask, envelope
+        self._refresh = refresh
+        self._given, self._names, self._max_feeders = given, names, max_feeders
+        self._threads = CapacityLimiter(FORWARDS)
+
+    async def __call__(
+        self, request: Request, identity: Identity, route: str, body: bytes
+    ) -> Response | None:
+        """Response of the owner; None if the front answers by itself.
+
+        Raises NoOwner, OutcomeUnknown, FeederFixed, TooManyFeeders.
+        """
+        call = self._call(request, identity, body)
+        if route == _BULK:
+            return await self._acknowledge(call)
+        feeder = await self._feeder_of(request, route, body)
+        if feeder is None:
+            return None
+        self._permit(route, feeder)
+        limit_s = DESIGN_S if route == f"PUT {_FEEDER}" else ANSWER_S
+        answer = await self.ask(feeder, call, limit_s)
+        if route in {f"PUT {_FEEDER}", f"DELETE {_FEEDER}"}:
+            await self._refresh()
+        return _response(answer)
+
+    def _permit(self, route: str, feeder: str) -> None:
+        """Check the rules for the whole fleet."""
+        if route == f"DELETE {_FEEDER}" and feeder in self._given:
+            raise FeederFixed(feeder)
+        if route == f"PUT {_FEEDER}" and feeder not in self._given:
+            put = self._names().keys() - self._given
+            if feeder not in put and len(put) >= self._max_feeders:
+                raise TooManyFeeders(self._max_feeders)
+
+    @staticmethod
+    def _call(request: Request, identity: Identity, body: bytes) -> Call:
+        headers = tuple((name, value) for name, value in request.headers.items() if name in FORWARDED)
+        return Call(request.method, request.url.path, request.url.query, headers, body, identity)
+
+    async def ask(self, feeder: str, call: Call, limit_s: float = ANSWER_S) -> Answer:
+        """Answer of a feeder's owner. Raises NoOwner, OutcomeUnknown."""
+        found = self._workers.owner(feeder)
+        if found is None:
+            raise NoOwner(feeder)
+        answer = await self.ask_worker(found[0].worker, call, limit_s)
+        if answer is None and call.method == "GET":
+            raise NoOwner(feeder)
+        if answer is None:
+            text = f"no answer of the owner of feeder {feeder!r}; the outcome is not known"
+            raise OutcomeUnknown(text)
+        return answer
+
+    async def ask_worker(self, worker: str, call: Call, limit_s: float = ANSWER_S) -> Answer | None:
+        """Answer of a worker; None without one."""
+        return await to_thread.run_sync(
+            self.ask_blocking, worker, call, limit_s, abandon_on_cancel=True, limiter=self._threads
+        )
+
+    def ask_blocking(self, worker: str, call: Call, limit_s: float) -> Answer | None:
+        """Answer of a worker; None without one. Blocks."""
+        key = rest_key(worker)
+        message = self._envelope.seal(f"call {key}", call.content())
+        number = self._envelope.open(f"call {key}", message)["id"]
+        try:
+            replies = self._ask(key, message, limit_s)
+        except BusUnavailable:
+            return None
+        for reply in replies:
+            try:
+                content = self._envelope.open(f"answer {key}", reply)
+                if content["to"] == number:
+                    return Answer.of(content)
+            except (GridsecError, ValueError, KeyError, TypeError):
+                continue
+        return None
+
+    # ------------------------------------------------------------------------------- the feeder of a request
+
+    async def _feeder_of(self, request: Request, route: str, body: bytes) -> str | None:
+        """Feeder of a request that its owner answers, or None."""
+        method, _, path = route.partition(" ")
+        given = request.path_params
+        if path.startswith(_FEEDER):
+            return None if path.endswith("/stream") else str(given["feeder"])
+        if method == "GET":
+            return None
+        return await to_thread.run_sync(self._subject, path, given, body)
+
+    def _subject(self, path: str, given: Mapping[str, Any], body: bytes) -> str | None:
+        """Feeder of what a command changes; None if it does not exist: the front refuses the command."""
+        finders: Mapping[str, Callable[[str], Any]] = {
+            "alarm": self._store.alarm,
+            "incident": self._store.incident,
+            "shelf": self._store.shelf,
+            "work": self._store.work,
+        }
+        for name, find in finders.items():
+            if f"{name}_id" in given:
+                found = find(given[f"{name}_id"])
+                return None if found is None else str(found.feeder)
+        if path not in {"/api/v1/shelves", "/api/v1/planned-work"}:
+            return None
+        wanted = _object(body)
+        for name in ("alarm", "incident"):
+            if isinstance(number := wanted.get(name), str):
+                found = finders[name](number)
+                return None if found is None else str(found.feeder)
+        feeder = wanted.get("feeder")
+        return feeder if isinstance(feeder, str) and feeder in self._names() else None
+
+    async def _acknowledge(self, call: Call) -> Response | None:
+        """Acknowledge alarms of several owners: one request to each, in the order of the alarms.
+
+        Unknown alarms are refused before. After the failure of an owner the earlier ones have acknowledged
+        theirs; a repetition acknowledges the others.
+        """
+        wanted = _object(call.body)
+        names = wanted.get("alarms")
+        if not isinstance(names, list) or not all(isinstance(one, str) for one in names):
+            return None
+        parts = await to_thread.run_sync(self._by_owner, names)
+        found: list[Any] = []
+        for feeder, part in parts.items():
+            body = json.dumps({**wanted, "alarms": part}).encode()
+            own = Call(call.method, call.path, call.query, _plain(call.headers), body, call.identity)
+            answer = await self.ask(feeder, own)
+            if answer.status != 200:
+                return _response(answer)
+            found.extend(json.loads(answer.body))
+        order = {name: k for k, name in enumerate(names)}
+        found.sort(key=lambda alarm: order[alarm["id"]])
+        return Response(json.dumps(found), media_type="application/json")
+
+    def _by_owner(self, names: Sequence[str]) -> dict[str, list[str]]:
+        """Alarms by a feeder of each owner. Raises AlarmUnknown, NoOwner."""
+        feeders: dict[str, str] = {}
+        for name in names:
+            if (alarm := self._store.alarm(name)) is None:
+                raise AlarmUnknown(name)
+            feeders[name] = alarm.feeder
+        parts: dict[str, tuple[str, list[str]]] = {}
+        for name, feeder in feeders.items():
+            if (owner := self._workers.owner(feeder)) is None:
+                raise NoOwner(feeder)
+            parts.setdefault(owner[0].worker, (feeder, []))[1].append(name)
+        return dict(parts.values())
+
+
+def get(path: str, query: str = "") -> Call:
+    """A request of the front itself."""
+    return Call("GET", path, query, (("accept", "application/json"),), b"", OPEN)
+
+
+def _object(body: bytes) -> dict[str, Any]:
+    """Object of a JSON body; empty for another body, which the front or the owner refuses."""
+    try:
+        found = json.loads(body)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _plain(headers: Sequence[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
+    """Headers without compression of the answer."""
+    return tuple(pair for pair in headers if pair[0] != "accept-encoding")
+
+
+def _response(answer: Answer) -> Response:
+    made = Response(answer.body, answer.status)
+    for name, value in answer.headers:
+        made.headers.append(name, value)
+    return made

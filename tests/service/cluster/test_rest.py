@@ -1,0 +1,115 @@
+"""Requests from a front to a worker: real zenoh, the real HTTP application, a small service."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from service.access.identity import OPEN, Identity, Role
+from service.api.routes import create_api
+from service.cluster.envelope import Envelope
+from service.cluster.forward import Forwarder, get
+from service.cluster.rest import Call, RestServer, rest_key
+from service.cluster.workers import Workers
+from service.ingest.queues import BusConfig
+from service.ingest.zenoh_bus import Bus
+from tests.service.asking import LIE, T0
+from tests.service.conftest import SmallService, Village
+from tests.service.running import free_port
+
+JSON = (("content-type", "application/json"),)
+ADA = Identity("Ada", Role.OPERATOR, frozenset({"village"}), "key 7")
+
+
+def bus(config: BusConfig) -> Bus:
+    return Bus(config, "gridsec", lambda _: None, max_payload=1000, lossless=False, everything=False)
+
+
+class Pair:
+    """A worker `w0` with a small service, and the way to it."""
+
+    def __init__(self, service: SmallService, worker: Bus, front: Bus) -> None:
+        self.service = service
+        self.loop = asyncio.new_event_loop()
+        self.thread = threading.Thread(target=self.loop.run_forever, daemon=True)
+        self.thread.start()
+        self.key = rest_key("w0")
+        envelope = Envelope(b"secret")
+        worker.serve(self.key, RestServer(create_api(service), self.key, envelope, self.loop))
+        self.front, self.envelope = front, envelope
+        workers = Workers(envelope)
+        self.forwarder = Forwarder(
+            workers,
+            service.store,
+            front.ask,
+            envelope,
+            names=dict,
+            refresh=asyncio.Event().wait,  # type: ignore[arg-type]
+        )
+
+    def ask(self, call: Call) -> tuple[int, dict[str, object]]:
+        answer = self.forwarder.ask_blocking("w0", call, 5.0)
+        assert answer is not None
+        return answer.status, json.loads(answer.body)
+
+    def close(self) -> None:
+        self.loop.call_soon_threadsafe(self.loop.stop)
+        self.thread.join(5.0)
+        self.loop.close()
+
+
+@pytest.fixture
+def pair(small_service: Callable[..., SmallService]) -> Iterator[Pair]:
+    end = f"tcp/127.0.0.1:{free_port()}"
+    with bus(BusConfig(listen=(end,))) as front, bus(BusConfig("client", connect=(end,))) as worker:
+        made = Pair(small_service(Village(), Village("town")), worker, front)
+        yield made
+        made.close()
+
+
+def test_a_worker_answers_as_its_own_http_would(pair: Pair) -> None:
+    status, body = pair.ask(get("/api/v1/feeders/village/state"))
+    assert (status, body["instance"]) == (503, "/api/v1/feeders/village/state")
+    village = pair.service.villages["village"]
+    for k in range(4):
+        pair.service.tick(village.report(T0 + k, lies=LIE))
+    status, body = pair.ask(get("/api/v1/feeders/village/state"))
+    assert (status, body["verdict"], body["t"]) == (200, "attacked", T0 + 3)
+    status, body = pair.ask(get("/api/v1/feeders", "limit=1&colour=red"))
+    assert status == 422
+
+
+def test_the_identity_of_the_front_counts(pair: Pair) -> None:
+    village = pair.service.villages["village"]
+    for k in range(4):
+        pair.service.tick(village.report(T0 + k, lies=LIE))
+    (alarm,), _ = pair.service.store.alarms()
+
+    def acknowledge(identity: Identity, body: dict[str, str]) -> tuple[int, dict[str, object]]:
+        path = f"/api/v1/alarms/{alarm.id}/ack"
+        return pair.ask(Call("POST", path, "", JSON, json.dumps(body).encode(), identity))
+
+    stranger = Identity("Eve", Role.OPERATOR, frozenset({"town"}), "key 8")
+    assert acknowledge(stranger, {"comment": ""})[0] == 404
+    assert acknowledge(OPEN, {"comment": ""})[0] == 422
+    status, body = acknowledge(ADA, {"comment": "seen"})
+    assert (status, body["acknowledged_by"]) == (200, "Ada")
+
+
+def test_without_the_secret_nothing_is_executed_or_believed(pair: Pair) -> None:
+    call = get("/api/v1/feeders")
+    forged = Envelope(b"guess").seal(f"call {pair.key}", call.content())
+    assert pair.front.ask(pair.key, forged, 5.0) == [b""]
+    message = pair.envelope.seal(f"call {pair.key}", call.content())
+    (first,) = pair.front.ask(pair.key, message, 5.0)
+    assert first
+    # A repetition is not executed.
+    assert pair.front.ask(pair.key, message, 5.0) == [b""]
+
+
+def test_a_worker_that_is_gone_gives_no_answer(pair: Pair) -> None:
+    assert pair.forwarder.ask_blocking("w1", get("/healthz"), 5.0) is None

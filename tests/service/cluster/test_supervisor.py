@@ -1,0 +1,82 @@
+"""Local workers of a front: started again, and ended with it; here processes that only wait."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from collections.abc import Callable
+
+import pytest
+
+from service.cluster import supervisor
+from service.cluster.supervisor import Supervisor, worker_environment
+from service.settings import Settings, settings
+from tests.service.running import until
+
+WAITING = (sys.executable, "-S", "-c", "import sys; sys.stdin.read()")
+DEAF = (
+    sys.executable,
+    "-S",
+    "-c",
+    "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60)",
+)
+
+
+async def reached(condition: Callable[[], bool]) -> None:
+    await asyncio.to_thread(until, condition, "the number of processes", 10.0)
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("command", [WAITING, DEAF], ids=["waiting", "deaf"])
+def test_workers_are_started_again_and_end_with_the_front(
+    command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervisor, "AGAIN_S", 0.05)
+    monkeypatch.setattr(supervisor, "END_S", 0.3)
+
+    async def run() -> None:
+        made = Supervisor(2, dict(os.environ), command)
+        task = asyncio.create_task(made.run())
+        await reached(lambda: len(made.pids) == 2)
+        first, second = made.pids
+        os.kill(first, signal.SIGKILL)
+        await reached(lambda: len(made.pids) == 2 and first not in made.pids)
+        assert second in made.pids
+        pids = made.pids
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        assert [alive(pid) for pid in pids] == [False, False]
+
+    asyncio.run(run())
+
+
+def test_workers_have_the_settings_of_their_front(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GRIDSEC_HTTP", "127.0.0.1:9000")
+    monkeypatch.setenv("NOTIFY_SOCKET", "/run/notify")
+    chosen = {
+        "database": "postgresql+psycopg://gridsec@/grid",
+        "zenoh_listen": ("tcp/127.0.0.1:7448",),
+        "prefix": "grid",
+        "max_skew_s": 7.5,
+        "workers": 3,
+    }
+    environment = worker_environment(settings(chosen))
+    assert "NOTIFY_SOCKET" not in environment
+    for name in [one for one in os.environ if one.startswith("GRIDSEC_")]:
+        monkeypatch.delenv(name)
+    for name, value in environment.items():
+        if name.startswith("GRIDSEC_"):
+            monkeypatch.setenv(name, value)
+    found = Settings()
+    assert (found.database, found.prefix, found.max_skew_s) == (chosen["database"], "grid", 7.5)
+    assert (found.zenoh_mode, found.zenoh_connect) == ("client", ("tcp/127.0.0.1:7448",))
+    assert (found.http, found.workers, found.zenoh_listen) == ("127.0.0.1:8000", None, ())
