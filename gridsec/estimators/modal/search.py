@@ -45,7 +45,7 @@ import numpy as np
 from scipy.cluster.hierarchy import linkage
 from scipy.linalg import blas, cho_solve, cholesky, lapack
 
-from gridsec.arrays import Bools, Floats, Ints, frozen
+from gridsec.arrays import Bools, Floats, Ints, frozen, submatrix
 from gridsec.estimators.modal.model import Modes
 
 DOUBT = 1e-3
@@ -201,6 +201,9 @@ def costs(problem: SearchProblem, sets: Bools, share: float = 0.0) -> Floats:
     share
         Share in common, 0 to 1.
     """
+    meters = np.count_nonzero(sets[:, : problem.meters], axis=1)
+    out = penalties(problem.meters)[meters] + (problem.charge.max(initial=0.0) if share else 0.0)
+    problem, sets = _among(problem, np.logical_or.reduce(sets, axis=0)), sets[:, sets.any(axis=0)]
     p, q, shared = problem.meters, problem.y.size, np.logical_and.reduce(sets, axis=0)
     std = np.where(np.arange(q) < p, np.sqrt(1.0 - share), 1.0) * problem.std
     base = Tableau(replace(problem, std=std)).pivot(shared)
@@ -214,16 +217,27 @@ def costs(problem: SearchProblem, sets: Bools, share: float = 0.0) -> Floats:
         felt = w - w[J] @ base.A[J, :q]
         pulls.append(np.where(inside, felt[at], 0.0))
     log_det, inner = _inner(A, np.stack(pulls, axis=1))
-    count = np.count_nonzero(sets[:, :p], axis=1)
-    out = base.cost - base.penalty[base.count] + base.penalty[count] + log_det - inner[:, 0, 0]
+    out = out + base.cost - base.penalty[base.count] + log_det - inner[:, 0, 0]
     out += np.where(inside, (base.size + problem.charge)[at], 0.0).sum(axis=1)
     if share:
         score = w[J] @ base.A[J, q] + inner[:, 0, 1]
-        information = count / (1.0 - share) + w[J] @ base.A[np.ix_(J, J)] @ w[J] - inner[:, 1, 1]
+        information = meters / (1.0 - share) + w[J] @ base.A[np.ix_(J, J)] @ w[J] - inner[:, 1, 1]
         information = np.maximum(information, 0.0)
         out += np.log1p(share * information) - score * score / (information + 1.0 / share)
-        out += problem.charge.max(initial=0.0)
     return np.asarray(out)
+
+
+def _among(problem: SearchProblem, used: Bools) -> SearchProblem:
+    """The problem with some faults (q,) only."""
+    at = np.flatnonzero(used)
+    return SearchProblem(
+        problem.y[at],
+        submatrix(problem.F, at, at),
+        problem.std[at],
+        int(np.count_nonzero(used[: problem.meters])),
+        problem.charge[at],
+        problem.bound[at],
+    )
 
 
 def padded(sets: Bools) -> tuple[Ints, Bools]:

@@ -110,6 +110,20 @@ def test_a_mixture_contains_the_disagreement() -> None:
     assert np.allclose(after.variance, 1e-4 + own + f**2)
 
 
+def test_the_variance_is_evaluated_once_and_where_asked_for() -> None:
+    asked = []
+
+    def spread() -> Floats:
+        asked.append(True)
+        return np.array([4.0])
+
+    found = estimate.Estimated(np.zeros(1), spread)
+    assert not asked
+    assert (found.variance == 4.0).all()
+    assert (found.variance == 4.0).all()
+    assert len(asked) == 1
+
+
 def test_coverage_in_simulation() -> None:
     """Errors over their standard deviations at buses without meters: root mean square near 1."""
     model = some_meters()
