@@ -1,6 +1,6 @@
 """Cost of many feeders in one process: time by stage, rates of decoding, meters held at one reading a second.
 
-    python -m benchmarks.fleet [SECONDS] [MOST] [OTHER_TREE] [--costs]
+    python -m benchmarks.fleet [SECONDS] [MOST] [OTHER_TREE] [--costs] [--workers]
 
 Feeders are copies of the Kerber suburban network, 146 meters and the busbar each. All ratios are of one run.
 
@@ -53,6 +53,8 @@ from service.ingest.zenoh_bus import Bus, MeterClient, session
 from service.report.tick_state import TickState
 from service.store import Store
 from service.store.committer import Committer
+from tests.service.databases import Cluster as Server
+from tests.service.databases import find_postgresql
 
 FEEDER = "kerber-vorstadtnetz"
 FORMATS = {
@@ -73,6 +75,7 @@ SIMULATED = 60
 LATE_S = 1.0
 """Age of a tick's result, s, from which it is late."""
 FIRST, GROWTH = 8, 1.5
+WORKERS = 2
 
 Put = tuple[str, bytes, str]
 
@@ -88,9 +91,17 @@ class Nowhere:
     def telemetry(self, key: str, payload: Value) -> None:
         """Build nothing."""
 
-    def event(self, key: str, payload: bytes, *, last: bool, done: Callable[[], None] | None = None) -> bool:
+    def event(
+        self,
+        key: str,
+        payload: bytes,
+        *,
+        last: bool,
+        number: int,
+        done: Callable[[], None] | None = None,
+    ) -> bool:
         """Confirm at once."""
-        self.counts.published += bool(key and payload is not None) + last
+        self.counts.published += 1
         if done is not None:
             done()
         return True
@@ -390,13 +401,37 @@ OWN = Path(__file__).parents[1]
 
 
 def spent_s(process: int) -> float:
-    """Processor time of a process and all its threads, s."""
+    """Processor time of a process, all its threads and its living children, s."""
     fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
+    own = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return own + sum(spent_s(int(one)) for one in children)
+
+
+@contextmanager
+def postgresql() -> Iterator[Server]:
+    """Run a server of PostgreSQL until the block ends."""
+    binaries = find_postgresql()
+    if binaries is None:
+        raise SystemExit("PostgreSQL's initdb, pg_ctl and postgres are not installed")
+    with tempfile.TemporaryDirectory(prefix="gridsec-pg-", dir="/tmp") as data:
+        server = Server(binaries, Path(data))
+        server.start()
+        try:
+            yield server
+        finally:
+            server.stop()
 
 
 def holds(
-    site: Site, folder: Path, number: int, form: str, *, seconds: float, tree: Path = OWN
+    site: Site,
+    folder: Path,
+    number: int,
+    form: str,
+    *,
+    seconds: float,
+    tree: Path = OWN,
+    server: Server | None = None,
 ) -> tuple[bool, float, str]:
     """True if that many feeders are held; processor time for a reading, s; a line of figures."""
     names = [f"feeder-{k:04d}" for k in range(number)]
@@ -404,7 +439,8 @@ def holds(
     place.mkdir()
     for name in names:
         write(replace(site.tables, meta=replace(site.tables.meta, name=name)), place / name)
-    with running(tree, place, names) as service:
+    workers, database = (0, None) if server is None else (WORKERS, server.database())
+    with running(tree, place, names, workers=workers, database=database) as service:
         fleet = Fleet(site, names, form, service.zenoh)
         fleet.start()
         try:
@@ -444,13 +480,13 @@ def print_against(site: Site, seconds: float, tree: Path) -> None:
             )
 
 
-def print_fleet(site: Site, seconds: float, most: int) -> None:
-    """Print the number of meters that one process holds."""
+def print_fleet(site: Site, seconds: float, most: int, server: Server | None = None) -> None:
+    """Print the number of meters that one process, or two workers, hold."""
     with tempfile.TemporaryDirectory() as folder:
         for form in ("json", "arrow"):
             best, number = 0, FIRST
             while number <= most:
-                held, _, text = holds(site, Path(folder), number, form, seconds=seconds)
+                held, _, text = holds(site, Path(folder), number, form, seconds=seconds, server=server)
                 print(f"{'held' if held else 'not held'}: {text}", flush=True)
                 if not held:
                     break
@@ -464,10 +500,14 @@ TICK_MAX, SINGLES_MIN, BATCHES_MIN = 3.0, 0.2, 1e5
 
 def main() -> int:
     """Measure."""
-    asked = arguments(__doc__, seconds=20.0, most=200, against="", costs=False)
+    asked = arguments(__doc__, seconds=20.0, most=200, against="", costs=False, workers=False)
     site = load(FEEDER)
     if asked.against:
         print_against(site, asked.seconds, Path(asked.against).resolve())
+        return 0
+    if asked.workers:
+        with postgresql() as server:
+            print_fleet(site, asked.seconds, asked.most, server)
         return 0
     tick = print_stages(site)
     singles, batches = print_rates(site)

@@ -124,17 +124,24 @@ def load_of(site: Site, names: Sequence[str]) -> Load:
     return Load(keys, tuple(rows))
 
 
+PROGRAM = "from service.cli.main import main; main()"
+
+
 @contextmanager
-def running(tree: Path, folder: Path, names: Sequence[str]) -> Iterator[Service]:
-    """Run the service of a source tree until the block ends."""
+def running(
+    tree: Path, folder: Path, names: Sequence[str], *, workers: int = 0, database: str | None = None
+) -> Iterator[Service]:
+    """Run the service of a source tree until the block ends: one process, or a front with workers."""
     http, zenoh = free_ports(2)
     totals, log = folder / "totals.json", folder / "service.log"
     script = Path(__file__).with_name("_overload_service.py")
     command = [sys.executable, str(script), str(totals)]
+    if workers:
+        command = [sys.executable, "-c", PROGRAM, "serve", "--workers", str(workers)]
     for name in names:
         command += ["--feeder", str(folder / name)]
     command += ["--http", f"127.0.0.1:{http}", "--zenoh-listen", f"tcp/127.0.0.1:{zenoh}"]
-    command += ["--database", f"sqlite:///{folder / f'{tree.name}.db'}"]
+    command += ["--database", database or f"sqlite:///{folder / f'{tree.name}.db'}"]
     environment = {**os.environ, "PYTHONPATH": str(tree)}
     with log.open("wb") as out, httpx.Client(base_url=f"http://127.0.0.1:{http}", timeout=30.0) as client:
         process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=environment, cwd=tree)
