@@ -39,7 +39,7 @@ def main() -> None:
                 trial = Trial(live, server, random.Random(int(time.time())))
                 trial.begin()
                 for _ in range(given.repetitions):
-                    for fault in (Fault.KILL, Fault.FREEZE, Fault.TERMINATE, Fault.ROUTER):
+                    for fault in (Fault.STOP, Fault.KILL, Fault.FREEZE, Fault.TERMINATE, Fault.ROUTER):
                         print(f"{fault}: {trial.strike(fault):.1f} s", flush=True)
                 print(f"{Fault.OUTAGE} of {OUTAGE_S:g} s: {trial.strike(Fault.OUTAGE):.1f} s", flush=True)
         finally:

@@ -29,7 +29,7 @@ from service.engine.engine import RuntimeConfig
 from service.engine.runtime import Runtime
 from service.errors import prefixed
 from service.ingest.align import Clock
-from service.ingest.queues import BusConfig
+from service.ingest.queues import BusConfig, Sample, StoredEvent
 from service.ingest.zenoh_bus import Bus
 from service.metrics import Metrics
 from service.notify.delivery import Notifier
@@ -76,7 +76,7 @@ async def serve(
     BusUnavailable, AddressUnavailable if the service cannot start.
     """
     shares = Shares.of(raise_limit())
-    meter_keys = settings.read_meter_keys()
+    config = runtime_config(settings)
     targets = read_notify(settings)
     sites = {
         name: choose(site, estimator=settings.estimator)
@@ -88,44 +88,56 @@ async def serve(
         given = tuple(sites)
         stored, unloaded = _stored(sites, store)
         sites |= stored
-        config = RuntimeConfig(
-            prefix=settings.prefix,
-            clock=settings.clock,
-            max_skew_s=settings.max_skew_s,
-            grace_s=settings.grace_s,
-            max_payload=settings.max_payload,
-            max_samples=settings.queue,
-            max_feeders=settings.max_feeders,
-            shelve_most_s=3600.0 * settings.max_shelve_h,
-            meter_keys=meter_keys,
-        )
         runtime = Runtime(
             config, store, sites.values(), given=given, unloaded=unloaded, wall=wall, settled=settled
         )
-        bus = stack.enter_context(
-            Bus(
-                bus_config(settings, shares),
-                settings.prefix,
-                runtime.deliver,
-                max_payload=settings.max_payload,
-                lossless=settings.clock is Clock.EVENTS,
-                wall=wall,
-                missed=partial(missed, store),
-            )
-        )
-        runtime.attach(bus)
+        bus = bus_of(settings, shares, runtime.deliver, missed=partial(missed, store), wall=wall)
+        runtime.attach(stack.enter_context(bus))
         await http.serve(stack, runtime, tuple(sites), announce=announce, signals=signals, stopping=stopping)
 
 
-def bus_config(settings: Settings, shares: Shares) -> BusConfig:
-    """Return the configuration of the zenoh session."""
-    return BusConfig(
+def runtime_config(settings: Settings) -> RuntimeConfig:
+    """Return the configuration of a runtime. Raises SettingsInvalid if the keys of meters cannot be read."""
+    return RuntimeConfig(
+        prefix=settings.prefix,
+        clock=settings.clock,
+        max_skew_s=settings.max_skew_s,
+        grace_s=settings.grace_s,
+        max_payload=settings.max_payload,
+        max_samples=settings.queue,
+        max_feeders=settings.max_feeders,
+        shelve_most_s=3600.0 * settings.max_shelve_h,
+        meter_keys=settings.read_meter_keys(),
+    )
+
+
+def bus_of(
+    settings: Settings,
+    shares: Shares,
+    deliver: Callable[[list[Sample]], object],
+    *,
+    missed: Callable[[str, int, int], Iterable[StoredEvent]] | None,
+    wall: Callable[[], float],
+    everything: bool = True,
+) -> Bus:
+    """Return the zenoh session of a process; the parameters are those of `Bus`."""
+    config = BusConfig(
         settings.zenoh_mode,
         settings.listen,
         settings.zenoh_connect,
         settings.zenoh_config,
         max_sessions=shares.sessions,
         accept_pending=shares.pending,
+    )
+    return Bus(
+        config,
+        settings.prefix,
+        deliver,
+        max_payload=settings.max_payload,
+        lossless=settings.clock is Clock.EVENTS,
+        wall=wall,
+        missed=missed,
+        everything=everything,
     )
 
 

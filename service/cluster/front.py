@@ -215,7 +215,7 @@ class Front:
 
     def feeders(self) -> list[dict[str, Any]]:
         """Return the entry of every feeder, with its worker; without one its phase is `no-owner`."""
-        last, found = self._workers.last_entries(), []
+        found = []
         for name in self.names():
             entry = self._workers.entry(name)
             if entry is not None:
@@ -223,8 +223,9 @@ class Front:
                 worker = None if owned is None else owned.worker
                 found.append({**entry.fields, "owner": worker})
                 continue
-            listed = self._catalogue.feeders.get(name)
-            known = last[name].fields if name in last else {"title": name if listed is None else listed.title}
+            listed, last = self._catalogue.feeders.get(name), self._workers.last_entry(name)
+            title = name if listed is None else listed.title
+            known = {"title": title} if last is None else last.fields
             found.append({**known, "name": name, "phase": str(Cause.NO_OWNER), "owner": None})
         return found
 
@@ -233,7 +234,7 @@ class Front:
         entry = self._workers.entry(name)
         if entry is not None:
             return self._aged(dict(entry.now))
-        before = self._workers.last_entries().get(name)
+        before = self._workers.last_entry(name)
         now = {} if before is None else dict(before.now)
         undecided = {
             "verdict": str(Decision.UNDECIDED),

@@ -12,7 +12,7 @@ from typing import Final
 from feeders.registry import choose
 from gridsec.errors import Problem
 from service.api.listener import Shares, raise_limit
-from service.app import HttpSide, Running, bus_config, load_sites, read_notify
+from service.app import HttpSide, Running, bus_of, load_sites, read_notify
 from service.cluster.catalogue import Catalogue
 from service.cluster.envelope import Envelope
 from service.cluster.forward import Forwarder
@@ -21,7 +21,6 @@ from service.cluster.status import STATES
 from service.cluster.supervisor import Supervisor, worker_environment
 from service.cluster.workers import Workers
 from service.ingest.align import Clock
-from service.ingest.zenoh_bus import Bus
 from service.settings import ENV_PREFIX, Settings, SettingsInvalid
 from service.store.cluster_secret import cluster_secret
 from service.store.committer import missed
@@ -83,18 +82,10 @@ async def serve_front(
             wall=wall,
         )
         workers.changed = front.heard
-        bus = stack.enter_context(
-            Bus(
-                bus_config(settings, shares),
-                settings.prefix,
-                lambda _: None,
-                max_payload=settings.max_payload,
-                lossless=False,
-                wall=wall,
-                missed=partial(missed, store),
-                everything=False,
-            )
+        bus = bus_of(
+            settings, shares, lambda _: None, missed=partial(missed, store), wall=wall, everything=False
         )
+        stack.enter_context(bus)
         forwarder = Forwarder(
             workers,
             store,

@@ -10,6 +10,7 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
@@ -18,15 +19,13 @@ import structlog
 from service import systemd
 from service.api.listener import Shares, raise_limit
 from service.api.routes import create_api
-from service.app import stop_on_signals
+from service.app import bus_of, runtime_config, stop_on_signals
 from service.cluster.catalogue import Catalogue
 from service.cluster.envelope import Envelope
 from service.cluster.member import Member
 from service.cluster.rest import RestServer, rest_key
 from service.cluster.status import Entry, WorkerState, report_states
-from service.engine.engine import RuntimeConfig
 from service.engine.runtime import Runtime
-from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import Bus
 from service.settings import Settings
 from service.store import Store
@@ -69,38 +68,12 @@ async def work(
         leases.register()
         store = stack.enter_context(Store(settings.database, leases=leases))
         member = Member(leases, Catalogue(store))
-        config = RuntimeConfig(
-            prefix=settings.prefix,
-            max_skew_s=settings.max_skew_s,
-            grace_s=settings.grace_s,
-            max_payload=settings.max_payload,
-            max_samples=settings.queue,
-            max_feeders=NO_LIMIT,
-            shelve_most_s=3600.0 * settings.max_shelve_h,
-            meter_keys=settings.read_meter_keys(),
-            ownership=member.ownership,
-            acts=member.acts,
+        config = replace(
+            runtime_config(settings), max_feeders=NO_LIMIT, ownership=member.ownership, acts=member.acts
         )
         runtime = Runtime(config, store, (), given=(), wall=wall, settled=settled)
-        bus = stack.enter_context(
-            Bus(
-                BusConfig(
-                    settings.zenoh_mode,
-                    settings.zenoh_listen,
-                    settings.zenoh_connect,
-                    settings.zenoh_config,
-                    max_sessions=shares.sessions,
-                    accept_pending=shares.pending,
-                ),
-                settings.prefix,
-                runtime.deliver,
-                max_payload=settings.max_payload,
-                lossless=False,
-                wall=wall,
-                missed=None,
-                everything=False,
-            )
-        )
+        bus = bus_of(settings, shares, runtime.deliver, missed=None, wall=wall, everything=False)
+        stack.enter_context(bus)
         runtime.attach(bus)
         loop = asyncio.get_running_loop()
         key = rest_key(name)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -85,8 +85,8 @@ class Workers:
         found = self.owner(feeder)
         return None if found is None else found[0].feeders.get(feeder)
 
-    def last_entries(self) -> Mapping[str, Entry]:
-        """Latest entries of all feeders, also of silent workers."""
+    def last_entry(self, feeder: str) -> Entry | None:
+        """Latest entry of a feeder, also of a silent worker; None before the first one."""
         with self._lock:
-            heard = sorted(self._heard.values(), key=lambda one: one.at)
-        return {name: entry for one in heard for name, entry in one.state.feeders.items()}
+            found = [one for one in self._heard.values() if feeder in one.state.feeders]
+        return max(found, key=lambda one: one.at).state.feeders[feeder] if found else None

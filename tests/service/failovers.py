@@ -29,6 +29,7 @@ KIND = "meter-manipulated"
 class Fault(StrEnum):
     """Kinds of faults."""
 
+    STOP = "stop"  # SIGTERM of a worker
     KILL = "kill"  # SIGKILL of a worker
     FREEZE = "freeze"  # SIGSTOP of a worker, then SIGCONT
     ROUTER = "router"  # SIGKILL of the front, which is the zenoh router, and its start
@@ -70,6 +71,7 @@ class Trial:
         """Cause a fault at a random moment of a tick; the time until the feeders are judged again, s."""
         time.sleep(self.rng.uniform(0.0, 2.0))
         lasted, decided = {
+            Fault.STOP: self.stop,
             Fault.KILL: self.kill,
             Fault.FREEZE: self.freeze,
             Fault.ROUTER: self.router,
@@ -88,6 +90,15 @@ class Trial:
         owners = self.live.owners()
         name = self.rng.choice(sorted({owner for owner in owners.values() if owner is not None}))
         return name, [feeder for feeder, owner in owners.items() if owner == name]
+
+    def stop(self) -> tuple[float, float]:
+        name, feeders = self.victim()
+        began = time.time()
+        self.live.workers[name].send(signal.SIGTERM)
+        lasted = self.judged(feeders, began)
+        if (code := self.live.workers[name].popen.wait(timeout=10.0)) != 0:
+            self.violations.append(f"stop: exit code {code}")
+        return lasted
 
     def kill(self) -> tuple[float, float]:
         name, feeders = self.victim()

@@ -114,10 +114,10 @@ def test_no_fault_loses_or_doubles_an_alarm(cluster: Cluster, tmp_path: Path, si
     with served_cluster(tmp_path, cluster.database(), site, 6, 3) as live:
         trial = Trial(live, cluster, random.Random(1))
         trial.begin()
-        faults = [Fault.KILL, Fault.FREEZE, Fault.TERMINATE, Fault.ROUTER]
-        for fault in (*faults, *trial.rng.sample(faults, 4), Fault.OUTAGE):
+        faults = [Fault.STOP, Fault.KILL, Fault.FREEZE, Fault.TERMINATE, Fault.ROUTER]
+        for fault in (*faults, *trial.rng.sample(faults, 2), Fault.OUTAGE):
             lasted = trial.strike(fault)
-            assert lasted < {Fault.KILL: KILLED_S}.get(fault, FROZEN_S), fault
+            assert lasted < {Fault.STOP: KILLED_S, Fault.KILL: KILLED_S}.get(fault, FROZEN_S), fault
             assert trial.violations == []
 
 
