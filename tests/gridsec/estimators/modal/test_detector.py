@@ -7,6 +7,7 @@ from math import inf, log, sqrt
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from benchmarks._residuals import Dense, Source, model_of, power_columns, tree
 from gridsec.arrays import Bools, Floats
@@ -127,8 +128,9 @@ def test_ratios_with_missing_readings_have_means_of_at_most_1(make: object, kind
         s2 = 0.3 / now.information.max(axis=1)
         whole.append(np.exp([detector.omnibus(now, each)[k] for k, each in enumerate(s2)]))
         single.append(np.exp(detector.log_lambda(y, F, 0.3 / F.max(axis=1, keepdims=True))).mean(axis=1))
-    spread, error = np.mean(z, axis=0), 3.5 * np.sqrt(2.0 / runs)
-    assert (spread < 1.0 + error).all()
+    spread = np.mean(z, axis=0)
+    # One of a thousand cases exceeds this in any entry by chance.
+    assert (spread < chi2.ppf(1.0 - 1e-3 / spread.size, runs) / runs).all()
     assert spread[1:].max() > 0.6
     for each in (np.array(whole), np.array(single)):
         assert (each.mean(axis=0) - 3.0 * each.std(axis=0) / sqrt(runs) <= 1.0).all()
