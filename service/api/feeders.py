@@ -80,9 +80,9 @@ def list_feeders(
     limit: Annotated[int | None, Query(ge=1, le=5000, description="Without it all.")] = None,
 ) -> models.Feeders:
     """All feeders with the latest verdict of each, or a page of them, the worst first."""
-    alarms = backend.store.alarms_by_feeder()
+    alarms, incidents = backend.store.alarms_by_feeder(), backend.store.incidents_by_feeder()
     found = [
-        overview.standing(fields, backend.summary(name), alarms.get(name))
+        overview.standing(fields, backend.summary(name), alarms.get(name), incidents.get(name, 0))
         for fields in backend.feeders()
         if caller.sees(name := fields["name"])
     ]

@@ -152,6 +152,7 @@ class FeederSummary(BaseModel):
     silent: int = Field(default=0, description="Silent meters of customers at that tick.")
     alarms: int = Field(default=0, description="Active alarms.")
     raised: int = Field(default=0, description="Active alarms without an acknowledgement.")
+    incidents: int = Field(default=0, description="Open incidents: those with an active alarm.")
 
 
 class Feeders(BaseModel):

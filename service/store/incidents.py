@@ -382,6 +382,13 @@ class IncidentReader:
         with self._read() as connection:
             return int(connection.execute(query).scalar_one())
 
+    def incidents_by_feeder(self) -> dict[str, int]:
+        """Number of incidents with an active alarm, of the feeders that have any."""
+        i = INCIDENT.c
+        query = sa.select(i.feeder, sa.func.count()).where(i.state != str(IncidentState.CLEARED))
+        with self._read() as connection:
+            return {name: int(count) for name, count in connection.execute(query.group_by(i.feeder))}
+
     def incident_events(self, incident_id: str, after: int = 0, *, limit: int = 1000) -> list[IncidentEvent]:
         """Return the events of an incident, oldest first. `after` restricts to a higher number."""
         e = INCIDENT_EVENT.c
