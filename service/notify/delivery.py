@@ -181,14 +181,25 @@ class Delivery:
         self._channel, self._target, self._source, self._store = channel, channel.target, source, store
         self._random, self._count = random, count
         self._queue: deque[Notice] = deque()
-        self.position = self._begin(stored)
-        self._read_to = self.position.position
         self.dead = 0
-        self._failures = self.position.attempts
-        self._retry_at = self._poll_at = self._renew_at = -float("inf")
-        self._at_once = channel.at_once
-        self._unsaved = stored is None or stored != self.position
+        self._poll_at = self._renew_at = -float("inf")
         self._letters: list[DeadLetter] = []
+        self._start(stored)
+
+    def _start(self, stored: Position | None) -> None:
+        self._stored, self.position = stored, self._begin(stored)
+        self._read_to = self.position.position
+        self._failures = self.position.attempts
+        self._retry_at = -float("inf")
+        self._at_once = self._channel.at_once
+        self._unsaved = stored is None or stored != self.position
+
+    def resume(self, stored: Position | None) -> None:
+        """Continue from the position of another process, if one has sent since the last step."""
+        if stored is not None and stored != self._stored:
+            self._queue.clear()
+            self._letters = []
+            self._start(stored)
 
     def _begin(self, stored: Position | None) -> Position:
         newest = self._source.newest
@@ -362,7 +373,7 @@ class Delivery:
         except StoreUnavailable as error:
             _log.error("a target's position cannot be stored", target=self._target.name, problem=str(error))
             return
-        self._unsaved, self._letters = False, []
+        self._stored, self._unsaved, self._letters = self.position, False, []
 
 
 class Notifier:
@@ -452,11 +463,24 @@ class Notifier:
             )
         return found
 
+    def _step(self, delivery: Delivery, name: str, now: float, sent: bool) -> tuple[float, bool]:
+        """Make a step, if no other process sends.
+
+        sent: the previous step was made.
+        Returns due, sent: time of the next step, Unix s, and whether this one was made.
+        """
+        if not self.store.sends():
+            return now + POLL_S, False
+        if not sent:
+            delivery.resume(self.store.positions().get(name))
+        return delivery.step(now), True
+
     def _run(self, delivery: Delivery, wake: threading.Event, name: str) -> None:
+        sent = False
         while not self._stop.is_set():
             now = self._wall()
             try:
-                due = delivery.step(now)
+                due, sent = self._step(delivery, name, now, sent)
             except StoreUnavailable as error:
                 _log.warning("notifications cannot be read", target=name, problem=str(error))
                 due = now + POLL_S

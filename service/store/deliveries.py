@@ -7,12 +7,14 @@ PostgreSQL its tables are in the same database.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, Final
 
 import sqlalchemy as sa
 
+from service.store.connect import IDLE_S
 from service.store.schema import SEQ
 from service.store.shared import SharedDatabase
 
@@ -23,6 +25,7 @@ LETTERS_KEPT: Final = 10_000
 PROBLEM_CHARACTERS: Final = 500
 """Largest length of a stored problem, characters."""
 _LOCK: Final = 0x6772_6964_6E6F_7400
+_SENDER: Final = 0x6772_6964_6E6F_7401
 
 _META = sa.MetaData()
 _SCHEMA = sa.Table("notify_version", _META, sa.Column("version", sa.Integer, primary_key=True))
@@ -86,15 +89,57 @@ class DeliveryStore(SharedDatabase):
     """Positions and dead letters of one service. Methods block and are thread-safe.
 
     database: address of the service's database.
+    shared: several processes may send notifications; one of them does at a time (`sends`).
     Raises StoreUnavailable if the database cannot be opened, or is newer than this program.
     """
 
-    def __init__(self, database: str) -> None:
+    def __init__(self, database: str, *, shared: bool = False) -> None:
         super().__init__(database, SUFFIX, _META, _SCHEMA, lock=_LOCK)
+        self._shared = shared and not self._sqlite
+        self._change, self._closed = threading.Lock(), False
+        self._sender: sa.Connection | None = None
+        self._sends = False
 
     def __enter__(self) -> DeliveryStore:
         """Return the store."""
         return self
+
+    def close(self) -> None:
+        """Close all connections; idempotent."""
+        with self._change:
+            self._closed = True
+            self._end_session()
+        super().close()
+
+    def sends(self) -> bool:
+        """True if this process sends notifications: it holds an advisory lock, or has just taken it.
+
+        The server ends the session of a stopped process after `IDLE_S` without a call.
+        """
+        if not self._shared:
+            return True
+        with self._change, self._guard("read"):
+            if self._closed:
+                return False
+            try:
+                if self._sender is None:
+                    made = self._engine.connect().execution_options(isolation_level="AUTOCOMMIT")
+                    self._sender = made
+                    made.exec_driver_sql(f"SET idle_session_timeout = '{IDLE_S:g}s'")
+                if self._sends:
+                    self._sender.scalar(sa.select(1))
+                else:
+                    self._sends = bool(self._sender.scalar(sa.select(sa.func.pg_try_advisory_lock(_SENDER))))
+            except sa.exc.DBAPIError:
+                self._end_session()
+            return self._sends
+
+    def _end_session(self) -> None:
+        self._sends = False
+        if self._sender is not None:
+            self._sender.invalidate()
+            self._sender.close()
+            self._sender = None
 
     # ------------------------------------------------------------- positions
 

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -38,6 +39,7 @@ from service.notify.targets import Targets, Webhook
 from service.notify.webhook import secret_bytes, signature
 from service.store import Store, StoreUnavailable
 from service.store.deliveries import DeliveryStore, Position
+from tests.service.databases import Cluster
 from tests.service.receiver import Receiver, receiving
 from tests.service.running import until
 from tests.service.stored import T0, an_alarm, raised
@@ -430,3 +432,42 @@ def test_a_rotated_secret_file_takes_effect_at_the_next_start(tmp_path: Path, re
     WebhookChannel(target, Cancel()).send("msg_1", "{}", T0)
     (got,) = receiver.got
     assert got.headers["webhook-signature"] == f"v1,{signature(KEY, 'msg_1', str(int(T0)), b'{}')}"
+
+
+def senders() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name == "gridsec-notify"]
+
+
+@pytest.mark.postgresql
+def test_one_of_several_processes_sends(receiver: Receiver, cluster: Cluster) -> None:
+    url = cluster.database()
+    targets = Targets(webhook=(hook(receiver),))
+    with Store(url) as store, ExitStack() as stack:
+        until(lambda: not senders(), "the end of earlier threads")
+        notifiers = []
+        for _ in range(2):
+            kept = stack.enter_context(DeliveryStore(url, shared=True))
+            notifiers.append(Notifier(targets, IncidentSource(store), kept, Metrics()))
+        for notifier in notifiers:
+            stack.callback(notifier.close)
+            notifier.start()
+            until(notifiers[0].store.sends, "the sender")
+        for number in range(3):
+            store.commit([raised(an_alarm(number, feeder=f"f{number}"))])
+            for notifier in notifiers:
+                notifier.wake()
+        until(lambda: notifiers[0].status()[0].waiting == 0, "the messages")
+        assert (len(receiver.got), notifiers[1].store.sends()) == (3, False)
+        # The next one continues after the last message.
+        notifiers[0].close()
+        until(lambda: len(senders()) == 1, "the end of its thread")
+        notifiers[0].store.close()
+        until(notifiers[1].store.sends, "the next sender")
+        notifiers[1].look()
+        store.commit([raised(an_alarm(4, feeder="f4"))])
+        notifiers[1].wake()
+        until(lambda: len(receiver.got) >= 4, "the message")
+        until(lambda: notifiers[1].status()[0].waiting == 0, "the position")
+        assert len(receiver.got) == 4
+        notifiers[1].close()
+        until(lambda: not senders(), "the end of its thread")
