@@ -6,6 +6,7 @@ or planned work goes to the owner of its feeder. All other requests are answered
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, Final
@@ -29,6 +30,8 @@ ANSWER_S: Final = 15.0
 """Time limit of an answer, s: above the time limit of a command with the database."""
 DESIGN_S: Final = 600.0
 """Time limit of an answer to new tables of a feeder, s: the owner designs its monitor."""
+WATCH_S: Final = 0.1
+"""Interval at which the owner is compared while an answer is under way, s."""
 FORWARDS: Final = 64
 """Largest number of requests that wait for workers at a time."""
 _BULK: Final = "POST /api/v1/alarms/ack"
@@ -101,17 +104,34 @@ class Forwarder:
         return Call(request.method, request.url.path, request.url.query, headers, body, identity)
 
     async def ask(self, feeder: str, call: Call, limit_s: float = ANSWER_S) -> Answer:
-        """Answer of a feeder's owner. Raises NoOwner, OutcomeUnknown."""
-        found = self._workers.owner(feeder)
-        if found is None:
-            raise NoOwner(feeder)
-        answer = await self.ask_worker(found[0].worker, call, limit_s)
-        if answer is None and call.method == "GET":
-            raise NoOwner(feeder)
-        if answer is None:
+        """Answer of a feeder's owner; a read is repeated after a change of the owner.
+
+        Raises NoOwner, OutcomeUnknown.
+        """
+        reads = call.method == "GET"
+        while True:
+            owner = self._owner(feeder)
+            if owner is None:
+                raise NoOwner(feeder)
+            asked = asyncio.create_task(self.ask_worker(owner[0], call, limit_s))
+            # zenoh may miss the end of a session with a query under way.
+            while not asked.done() and self._owner(feeder) == owner:
+                await asyncio.wait({asked}, timeout=WATCH_S)
+            if not asked.done():
+                asked.cancel()
+                if reads:
+                    continue
+            elif (answer := asked.result()) is not None:
+                return answer
+            if reads:
+                raise NoOwner(feeder)
             text = f"no answer of the owner of feeder {feeder!r}; the outcome is not known"
             raise OutcomeUnknown(text)
-        return answer
+
+    def _owner(self, feeder: str) -> tuple[str, int] | None:
+        """Worker that monitors a feeder, and its epoch."""
+        found = self._workers.owner(feeder)
+        return None if found is None else (found[0].worker, found[1])
 
     async def ask_worker(self, worker: str, call: Call, limit_s: float = ANSWER_S) -> Answer | None:
         """Answer of a worker; None without one."""

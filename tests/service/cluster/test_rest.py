@@ -6,6 +6,7 @@ import asyncio
 import json
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import pytest
 
@@ -14,9 +15,14 @@ from service.api.routes import create_api
 from service.cluster.envelope import Envelope
 from service.cluster.forward import Forwarder, get
 from service.cluster.rest import Call, RestServer, rest_key
+from service.cluster.status import STATES, WorkerState
 from service.cluster.workers import Workers
+from service.errors import NoOwner
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import Bus
+from service.store import OutcomeUnknown
+from service.store.leases import shard_of
+from tests.codes import refused
 from tests.service.asking import LIE, T0
 from tests.service.conftest import SmallService, Village
 from tests.service.running import free_port
@@ -42,14 +48,13 @@ class Pair:
         worker.serve(self.key, RestServer(create_api(service), self.key, envelope, self.loop))
         self.front, self.envelope = front, envelope
         workers = Workers(envelope)
+        self.worker = worker
         self.forwarder = Forwarder(
-            workers,
-            service.store,
-            front.ask,
-            envelope,
-            names=dict,
-            refresh=asyncio.Event().wait,  # type: ignore[arg-type]
+            workers, service.store, front.ask, envelope, names=dict, refresh=self.refresh
         )
+
+    async def refresh(self) -> None:
+        pass
 
     def ask(self, call: Call) -> tuple[int, dict[str, object]]:
         answer = self.forwarder.ask_blocking("w0", call, 5.0)
@@ -113,3 +118,34 @@ def test_without_the_secret_nothing_is_executed_or_believed(pair: Pair) -> None:
 
 def test_a_worker_that_is_gone_gives_no_answer(pair: Pair) -> None:
     assert pair.forwarder.ask_blocking("w1", get("/healthz"), 5.0) is None
+
+
+def test_a_request_does_not_outlast_its_owner(pair: Pair) -> None:
+    workers, sender = Workers(pair.envelope), Envelope(b"secret")
+
+    def report(worker: str, epoch: int) -> None:
+        state = WorkerState(worker, 0.0, {shard_of("village"): epoch}, {}, 0, None, ())
+        workers.take(sender.seal(STATES, state.content()))
+
+    unanswered: list[Callable[[bytes], None]] = []
+    pair.worker.serve(rest_key("deaf"), lambda _, respond: unanswered.append(respond))
+    forwarder = Forwarder(
+        workers, pair.service.store, pair.front.ask, pair.envelope, names=dict, refresh=pair.refresh
+    )
+
+    async def ask(method: str) -> None:
+        report("deaf", 1)
+        asked = asyncio.create_task(
+            forwarder.ask("village", replace(get("/api/v1/feeders"), method=method), 5.0)
+        )
+        await asyncio.sleep(0.2)
+        assert not asked.done()
+        report("gone", 2)
+        await asked
+
+    with refused(NoOwner, "no-owner"):
+        asyncio.run(ask("GET"))
+    workers = Workers(pair.envelope)
+    forwarder._workers = workers
+    with refused(OutcomeUnknown, "outcome-unknown"):
+        asyncio.run(ask("POST"))
