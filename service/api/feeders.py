@@ -96,7 +96,8 @@ def get_feeder(
 ) -> Any:
     """A feeder: its tree, and the columns of its files."""
     fields = _detail(backend, feeder)
-    return unchanged(response, f'"{fields["revision"]}"', if_none_match) or fields
+    tag = f'"{fields["revision"]}-{fields.get("max_attacked", 0)}"'
+    return unchanged(response, tag, if_none_match) or fields
 
 
 @router.put("/{feeder}", response_model=models.FeederDetail, dependencies=[Depends(json_only)])
