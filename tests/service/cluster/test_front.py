@@ -104,8 +104,8 @@ def test_the_page_shows_it_as_undecided(live: ServedCluster, browser: Browser) -
     page.goto(f"{live.http.base_url}/#copy-0")
     expect(page.locator("#reason")).to_contain_text("no worker monitors feeder 'copy-0'")
     expect(page.locator("#fleet-rows tr")).to_have_count(2)
-    expect(page.locator("#fleet-counts")).to_have_text("2 undecided")
-    expect(page).to_have_title(re.compile("^UNDECIDED"))
+    expect(page.locator("#fleet-counts")).to_have_text("2 undecided: 2 no owner")
+    expect(page).to_have_title(re.compile("^NO OWNER"))
     page.close()
 
 

@@ -233,8 +233,7 @@ def put_back(connection: sa.Connection, version: int, *later: sa.Table) -> None:
 def test_a_database_from_before_signed_readings_were_kept_is_brought_forward(url: str) -> None:
     kept = StateSnapshot("village", T0, "{}", SnapshotKind.SIGNED)
     with Store(url) as old, old._write() as connection:
-        schema.SIGNED.drop(connection)
-        connection.execute(schema.VERSION.update().values(version=7))
+        put_back_workers(connection)
     with Store(url) as new:
         assert new.signed("village") is None
         new.commit(kept=[kept])
@@ -355,7 +354,7 @@ FULL_DISK = """
     from tests.service.stored import writable
     store = Store({url!r})
     bad = [Rejected(0.0, "k" * 500, "r" * 500) for _ in range(100)]
-    resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (600_000, resource.RLIM_INFINITY))
     done = 0
     try:
         while True:
