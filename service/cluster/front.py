@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import re
 import time
 from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
 from concurrent.futures import Future
@@ -24,10 +25,8 @@ from gridsec.interface import Cause, Decision
 from service.access.identity import OPEN
 from service.alarms.state_machine import Alarm, AlarmUnknown
 from service.cluster.catalogue import Catalogue
-from service.cluster.exposition import merged
-from service.cluster.forward import Forwarder, get
-from service.cluster.rest import Call
-from service.cluster.workers import Workers
+from service.cluster.forward import Forwarder, Workers, get
+from service.cluster.messages import Call
 from service.engine.commissioning import CommissioningProgress
 from service.engine.operators import Operators
 from service.errors import FeederUnknown, NoOwner
@@ -35,6 +34,43 @@ from service.metrics import Metrics
 from service.report.feeder_info import Ownership
 from service.report.report import FeederReport
 from service.store import Store, StoreUnavailable
+
+_SAMPLE = re.compile(rb"^([A-Za-z_:][A-Za-z0-9_:]*)(?:\{(.*)\})? (.+)$")
+"""A sample: name, labels, value with an optional time."""
+
+
+def merged(parts: Mapping[str, bytes]) -> bytes:
+    """Return the samples of all parts, those of one metric together; its help is that of the first part.
+
+    parts: text by worker; samples of the worker "" get no label.
+    """
+    heads: dict[bytes, list[bytes]] = {}
+    samples: dict[bytes, list[bytes]] = {}
+    for worker, text in parts.items():
+        family = b""
+        first: set[bytes] = set()
+        for line in text.splitlines():
+            if line.startswith((b"# HELP ", b"# TYPE ")):
+                family = line.split(b" ")[2]
+                if family not in heads:
+                    first.add(family)
+                if family in first:
+                    heads.setdefault(family, []).append(line)
+                samples.setdefault(family, [])
+            elif line and not line.startswith(b"#"):
+                samples.setdefault(family, []).append(_labelled(line, worker))
+    lines = [line for family, own in samples.items() for line in (*heads.get(family, ()), *own)]
+    return b"\n".join(lines) + b"\n" if lines else b""
+
+
+def _labelled(line: bytes, worker: str) -> bytes:
+    found = _SAMPLE.match(line)
+    if not worker or found is None:
+        return line
+    name, labels, value = found.groups()
+    both = b",".join(part for part in (labels, f'worker="{worker}"'.encode()) if part)
+    return b"%s{%s} %s" % (name, both, value)
+
 
 POLL_S: Final = 0.2
 """Interval of the reads of the newest event, s."""

@@ -52,7 +52,7 @@ from service.cli.paths import check_paths, write_tables
 from service.cli.replay import _site_of
 from service.cli.sources import converted
 from service.cli.study_report import STUDIES, Asked
-from service.cluster.envelope import Envelope
+from service.cluster.messages import Envelope
 from service.cluster.run import check_cluster
 from service.engine.commissioning import FeederCommissioning
 from service.engine.design_jobs import prepare

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from service.cluster.exposition import merged
+from service.cluster.front import merged
 from service.metrics import Metrics
 
 

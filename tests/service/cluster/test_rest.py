@@ -12,11 +12,8 @@ import pytest
 
 from service.access.identity import OPEN, Identity, Role
 from service.api.routes import create_api
-from service.cluster.envelope import Envelope
-from service.cluster.forward import Forwarder, get
-from service.cluster.rest import Call, RestServer, rest_key
-from service.cluster.status import STATES, WorkerState
-from service.cluster.workers import Workers
+from service.cluster.forward import Forwarder, Workers, get
+from service.cluster.messages import STATES, Call, Envelope, RestServer, WorkerState, rest_key
 from service.errors import NoOwner
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import Bus

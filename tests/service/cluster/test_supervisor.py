@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import pytest
 
-from service.cluster import supervisor
-from service.cluster.supervisor import Supervisor, worker_environment
+from service.cluster import run as module
+from service.cluster.run import Supervisor, worker_environment
 from service.settings import Settings, settings
 from tests.service.running import until
 
@@ -40,8 +40,8 @@ def alive(pid: int) -> bool:
 def test_workers_are_started_again_and_end_with_the_front(
     command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(supervisor, "AGAIN_S", 0.05)
-    monkeypatch.setattr(supervisor, "END_S", 0.3)
+    monkeypatch.setattr(module, "AGAIN_S", 0.05)
+    monkeypatch.setattr(module, "END_S", 0.3)
 
     async def run() -> None:
         made = Supervisor(2, dict(os.environ), command)

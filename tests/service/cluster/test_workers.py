@@ -7,10 +7,9 @@ from itertools import count
 
 import pytest
 
-from service.cluster import workers as module
-from service.cluster.envelope import Envelope
-from service.cluster.status import STATES, Entry, WorkerState
-from service.cluster.workers import Workers
+from service.cluster import forward as module
+from service.cluster.forward import Workers
+from service.cluster.messages import STATES, Entry, Envelope, WorkerState
 from service.store.leases import shard_of
 
 SHARD = shard_of("village")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.cluster.envelope import FRESH_S, Envelope, MessageRefused
+from service.cluster.messages import FRESH_S, Envelope, MessageRefused
 from tests.codes import refused
 
 
