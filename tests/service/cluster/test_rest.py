@@ -22,7 +22,7 @@ from service.store.leases import shard_of
 from tests.codes import refused
 from tests.service.asking import LIE, T0
 from tests.service.conftest import SmallService, Village
-from tests.service.running import free_port
+from tests.service.running import free_port, until
 
 JSON = (("content-type", "application/json"),)
 ADA = Identity("Ada", Role.OPERATOR, frozenset({"village"}), "key 7")
@@ -69,6 +69,7 @@ def pair(small_service: Callable[..., SmallService]) -> Iterator[Pair]:
     end = f"tcp/127.0.0.1:{free_port()}"
     with bus(BusConfig(listen=(end,))) as front, bus(BusConfig("client", connect=(end,))) as worker:
         made = Pair(small_service(Village(), Village("town")), worker, front)
+        until(lambda: front.ask(made.key, b"", 5.0), "the declaration of the worker at the front")
         yield made
         made.close()
 
