@@ -151,6 +151,7 @@ export class Incidents {
 
   render() {
     byId("incident-none").hidden = this.found.length > 0 || !byId("incident-error").hidden || !byId("incident-loading").hidden;
+    byId("incident-none").textContent = byId("incident-state").value === "all" ? "No incidents." : "No open incidents. Choose “All, with cleared” for earlier ones.";
     const focused = document.activeElement?.closest?.("[data-incident]");
     const [own, act] = [focused?.dataset.incident, document.activeElement?.dataset?.act];
     // Unchanged items keep their nodes: a click must not fall between two copies of a button.

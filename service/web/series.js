@@ -477,7 +477,7 @@ export class Series {
     return [
       ...found.flatMap((t) => [
         svg("line", { class: "grid", x1: x(t), x2: x(t), y1: top, y2: bottom + 4 }),
-        svg("text", { class: "axis", x: Math.min(Math.max(x(t), LEFT + 4), right + RIGHT - 26), y: bottom + 17, "text-anchor": "middle", text: labelOf(t, step) })]),
+        svg("text", { class: "axis", x: Math.min(Math.max(x(t), LEFT + 10), right + RIGHT - 26), y: bottom + 17, "text-anchor": "middle", text: labelOf(t, step) })]),
       svg("text", { class: "axis", x: LEFT - 22, y: bottom + 17, "text-anchor": "end", text: "local" }),
     ];
   }
