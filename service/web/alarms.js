@@ -1,7 +1,8 @@
 // Alarm list: loaded once, then updated by the event stream; actions on a single alarm, and its log.
 
 import { ask, post } from "./actions.js";
-import { byId, clock, deviceName, duration, el, getJson, isKnown, settle, guideLink, signed, sinceNode, volt } from "./dom.js";
+import { byId, clock, duration, el, getJson, isKnown, settle, guideLink, signed, sinceNode, volt } from "./dom.js";
+import { meterName, subjectOf } from "./names.js";
 
 const API = "/api/v1/alarms";
 const KIND = {
@@ -30,14 +31,11 @@ const EVERY_MS = 5000;
 const SOON_MS = 200;
 
 // Meters with stalled learning when the alarm was raised.
-function stalled({ learning = [] }) {
+function stalled({ feeder, evidence: { learning = [] } }) {
   if (!learning.length) return "";
   const more = learning.length > LISTED ? ` and ${learning.length - LISTED} more` : "";
-  return `. Meters: ${learning.slice(0, LISTED).map((m) => m.meter).join(", ")}${more}`;
+  return `. Meters: ${learning.slice(0, LISTED).map((m) => meterName(feeder, m.meter)).join(", ")}${more}`;
 }
-
-// Device of an alarm: a customer's inverter, a meter, or none for an alarm of the whole feeder.
-const subjectOf = ({ customer, meter, evidence }) => customer ?? deviceName(meter, evidence.customer);
 
 // An error of the feeder's files that explains the accusation as well.
 function hint({ data_error: error }) {
@@ -220,7 +218,7 @@ export class Alarms {
     const e = alarm.evidence;
     const numbers = isKnown(e.v_volt_reported) && alarm.kind === "meter-manipulated"
       ? `${volt(e.v_volt_reported)} reported, ${volt(e.v_volt_estimated)} reconstructed (${signed(e.v_volt_reported - e.v_volt_estimated)} V${e.kind ? `, ${e.kind}` : ""})`
-      : `${alarm.reason}${stalled(e)}`;
+      : `${alarm.reason}${stalled(alarm)}`;
     const subject = subjectOf(alarm);
     const where = subject ? `${subject} · ${alarm.feeder}` : alarm.feeder;
     const since = alarm.state === "cleared"

@@ -2,6 +2,7 @@
 
 import { ask, post } from "./actions.js";
 import { byId, clock, duration, el, getJson, guideLink, isKnown, settle, sinceNode } from "./dom.js";
+import { BUSBAR, customerName, meterName } from "./names.js";
 import { session } from "./session.js";
 
 const API = "/api/v1";
@@ -29,7 +30,6 @@ const ACTIONS = {
   work: { title: "Planned work", verb: "Enter", text: "Reason", needed: true },
 };
 const HOURS = [1, 4, 8, 24, 72, 168];
-const BUSBAR = "substation";
 const PAGE = 50;
 const ALARMS_SHOWN = 100;
 const METERS_LISTED = 20; // Largest number of meters in the choice of a shelf.
@@ -38,18 +38,18 @@ const SOON_MS = 200;
 
 const plural = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
 // Devices of an incident: one by name, several by number.
-function subject({ meters, customers }) {
+function subject({ feeder, meters, customers }) {
   const own = meters.filter((meter) => meter !== BUSBAR);
   const busbar = own.length < meters.length;
-  if (own.length) return `${own.length > 1 ? plural(own.length, "meter") : own[0]}${busbar ? " and the busbar meter" : ""}`;
-  if (busbar) return "busbar meter";
-  if (customers.length) return customers.length === 1 ? customers[0] : plural(customers.length, "inverter");
+  if (own.length) return `${own.length > 1 ? plural(own.length, "meter") : meterName(feeder, own[0])}${busbar ? " and the busbar meter" : ""}`;
+  if (busbar) return meterName(feeder, BUSBAR);
+  if (customers.length) return customers.length === 1 ? `inverter of ${customerName(feeder, customers[0])}` : plural(customers.length, "inverter");
   return null;
 }
 
 // Sentence on an incident: the devices of a manipulation, otherwise the reason of its severest alarm.
-function reasonOf({ kind, meters, customers, reason }) {
-  const named = [...meters, ...customers.map((customer) => `inverter of ${customer}`)];
+function reasonOf({ feeder, kind, meters, customers, reason }) {
+  const named = [...meters.map((meter) => meterName(feeder, meter)), ...customers.map((customer) => `inverter of ${customerName(feeder, customer)}`)];
   if (kind !== "manipulation" || !named.length) return reason;
   const more = named.length > METERS_LISTED ? ` and ${named.length - METERS_LISTED} more` : "";
   return named.length === 1 ? `${named[0]} ${reason}` : `Named as manipulated: ${named.slice(0, METERS_LISTED).join(", ")}${more}.`;
@@ -158,7 +158,7 @@ export class Incidents {
     const before = this.items;
     this.items = new Map(this.found.map((incident) => {
       const open = this.open.get(incident.id);
-      const said = JSON.stringify([incident, open, (open?.alarms ?? []).map((alarm) => this.alarms.content(alarm))]);
+      const said = JSON.stringify([incident, subject(incident), reasonOf(incident), open, (open?.alarms ?? []).map((alarm) => this.alarms.content(alarm))]);
       const old = before.get(incident.id);
       return [incident.id, old?.said === said ? old : { said, node: this.item(incident) }];
     }));
@@ -332,14 +332,14 @@ export class Incidents {
 
 // Alarms of a shelf.
 function shelved(one) {
-  const what = one.alarm ? "one alarm" : one.incident ? "one incident" : [one.meter, one.kind].filter(Boolean).join(", ");
+  const what = one.alarm ? "one alarm" : one.incident ? "one incident" : [one.meter && meterName(one.feeder, one.meter), one.kind].filter(Boolean).join(", ");
   return `${one.feeder}: ${what}`;
 }
 
 // Alarms that a shelf may cover: those of the incident, of one of its meters, of one of its kinds.
 function scopes({ id, feeder, meters, kinds }) {
   const own = [["this incident", { incident: id }]];
-  for (const meter of meters.slice(0, METERS_LISTED)) own.push([`all of ${meter}`, { feeder, meter }]);
+  for (const meter of meters.slice(0, METERS_LISTED)) own.push([`all of ${meterName(feeder, meter)}`, { feeder, meter }]);
   for (const kind of kinds) own.push([`all ${kind} of ${feeder}`, { feeder, kind }]);
   return own.map(([text, value]) => [JSON.stringify(value), text]);
 }

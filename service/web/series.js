@@ -1,10 +1,10 @@
 // Time series of meters: reported and reconstructed voltage with its uncertainty band, verdicts and alarms.
 // One panel per meter over a common time axis; minimum and maximum of each pixel column.
 
-import { bare, byId, clock, deviceName, duration, el, getJson, isKnown, nominals, svg, volt } from "./dom.js";
+import { bare, byId, clock, duration, el, getJson, isKnown, nominals, svg, volt } from "./dom.js";
+import { BUSBAR, meterName, subjectOf } from "./names.js";
 
 const API = "/api/v1/feeders";
-const BUSBAR = "substation";
 const MOST = 6; // Meters in one chart.
 const SPANS = [[3600, "1 h"], [21600, "6 h"], [86400, "24 h"], [604800, "7 d"], [1209600, "14 d"]];
 const [SHORTEST_S, LONGEST_S] = [60, 1209600];
@@ -220,8 +220,12 @@ export class Series {
 
   // Id of a meter, then its customer.
   name(meter) {
-    const customer = this.feeder.layout.customers.find((c) => c.meter === meter)?.customer;
-    return meter === BUSBAR ? "substation · busbar meter" : deviceName(meter, customer);
+    return meterName(this.feeder.name, meter);
+  }
+
+  // Device of an alarm, empty for the whole feeder.
+  subject(alarm) {
+    return subjectOf({ feeder: this.feeder.name, ...alarm });
   }
 
   add(meter) {
@@ -433,7 +437,8 @@ export class Series {
       if (row >= ALARM_ROWS) { more.count += 1; continue; }
       ends[row] = drawn + 2;
       const y = begin + row * ROW;
-      const what = `${alarm.kind}${alarm.customer ?? alarm.meter ? `, ${alarm.customer ?? alarm.meter}` : ""}: ${moment(alarm.t_raised)}, ${alarm.t_cleared === null ? "active" : `cleared ${moment(alarm.t_cleared)}`}`;
+      const about = this.subject(alarm);
+      const what = `${alarm.kind}${about ? `, ${about}` : ""}: ${moment(alarm.t_raised)}, ${alarm.t_cleared === null ? "active" : `cleared ${moment(alarm.t_cleared)}`}`;
       nodes.push(svg("g", { class: `alarm-span ${alarm.severity}${this.chosen.includes(alarm.meter) ? " own" : ""}` },
         svg("title", { text: what }),
         svg("rect", { x: a.toFixed(1), y, width: (drawn - a).toFixed(1), height: ROW - 3, rx: 2 }),
@@ -588,7 +593,7 @@ export class Series {
     for (const [name, value] of Object.entries({ x1: at, x2: at, visibility: "visible" })) this.cursor.setAttribute(name, value);
     const rows = data.meters.map((meter) => {
       const [[r0, r1], [e0, e1], [b0, b1]] = ["reported", "estimated", "band"].map((name) => extremes(meter, name, k, k + 1));
-      return el("span", {}, el("b", { text: meter.meter }), ` reported ${between(r0, r1)} V, reconstructed ${between(e0, e1)} V${isKnown(b0) ? ` (band ${between(b0, b1)} V)` : ""}`);
+      return el("span", {}, el("b", { text: this.name(meter.meter) }), ` reported ${between(r0, r1)} V, reconstructed ${between(e0, e1)} V${isKnown(b0) ? ` (band ${between(b0, b1)} V)` : ""}`);
     });
     tip.replaceChildren(el("b", { text: `${moment(data.t[k])} · ${verdictOf(data, k, k + 1)}` }), ...rows);
     tip.hidden = false;
@@ -629,7 +634,7 @@ export class Series {
     }
     byId("series-rows").replaceChildren(...rows);
     byId("series-alarms").replaceChildren(...data.alarms.map((alarm) => el("li", {
-      text: `${alarm.kind}, ${alarm.customer ?? alarm.meter ?? "whole feeder"}, ${alarm.severity}: raised ${clock(alarm.t_raised, { day: true })}, ${alarm.t_cleared === null ? "active" : `cleared ${clock(alarm.t_cleared, { day: true })}`}`,
+      text: `${alarm.kind}, ${this.subject(alarm) || "whole feeder"}, ${alarm.severity}: raised ${clock(alarm.t_raised, { day: true })}, ${alarm.t_cleared === null ? "active" : `cleared ${clock(alarm.t_cleared, { day: true })}`}`,
     })));
     byId("series-no-alarms").hidden = data.alarms.length > 0;
   }

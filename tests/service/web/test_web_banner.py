@@ -62,7 +62,9 @@ def test_candidates_of_an_undecided_verdict(site: Site) -> None:
     site.service.tick(replace(report, explanations=ways))
     page = site.open()
     expect(page.locator("#decision")).to_have_text("UNDECIDED")
-    expect(page.locator("#certainty")).to_have_text("Possible: H3 (60 %), or substation (40 %).")
+    expect(page.locator("#certainty")).to_have_text(
+        "Possible: H3 (60 %), or substation · busbar meter (40 %)."
+    )
     expect(page.locator("#next")).to_contain_text("Inspect the candidates, the likeliest first.")
     page.locator("#chips .chip:has-text('candidate H3')").click()
     expect(page.locator("#detail-title")).to_have_text("H3")
