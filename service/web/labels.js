@@ -5,6 +5,7 @@ const CHARACTER = 9.4; // Largest mean width of a bold character at 12 px, that 
 const LINE = 13; // Height of a line, px.
 const CASING = 3; // Margin of the text, as its stroke, px.
 const FAR = 8; // A label that is so much farther away may cover a symbol less, px.
+const BESIDE = 4; // Number of places beside the symbol.
 const NEAR = 40; // Distance of suspects within which the sides of their labels matter, px.
 
 const least = (all, cost) => all.reduce((best, one) => (best === undefined || cost(one) < cost(best) ? one : best), undefined);
@@ -39,10 +40,12 @@ export function placeLabels(marks, others, { width, height }) {
     const clashes = (c) => taken.filter((other, k) => k !== own && over(box(c), other)).length;
     const within = choices.filter((c) => inside(box(c)));
     const apart = within.filter((c) => clashes(c) === 0);
+    // The places beside the symbol are as good as each other: the first one wins.
+    const far = (c) => (choices.indexOf(c) < BESIDE ? choices.indexOf(c) / 100 : Math.hypot(c.x, c.y) / FAR);
     // Of two suspects above each other the upper one has the upper label.
     const near = marks.filter((other) => other !== mark && Math.hypot(other.x - mark.x, other.y - mark.y) < NEAR);
     const towards = (b) => near.filter((other) => (other.y - mark.y) * (b.y + tall / 2 - mark.y) > 0).length;
-    const cost = (c) => symbols.filter((other) => over(box(c), other)).length + towards(box(c)) + Math.hypot(c.x, c.y) / FAR;
+    const cost = (c) => symbols.filter((other) => over(box(c), other)).length + towards(box(c)) + far(c);
     const free = least(apart, cost) ?? least(within, clashes) ?? choices[0];
     taken.push(box(free));
     return free;
