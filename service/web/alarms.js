@@ -51,6 +51,7 @@ export class Alarms {
     this.heard = new Map(); // Newest event of each alarm during a request: the list may be older.
     this.raised = 0; // Number of active alarms without an acknowledgement, loaded or not.
     this.soon = null;
+    this.wanted = null; // Timer of a search.
     this.turn = 0;
     this.onPick = onPick;
     this.onLink = onLink;
@@ -61,15 +62,21 @@ export class Alarms {
     this.retry = null;
     this.problem = null; // Problem of the database: active alarms may be missing in the list.
     setInterval(() => this.check(), EVERY_MS);
-    for (const id of ["alarm-state", "alarm-kind"]) byId(id).addEventListener("change", () => this.reload());
+    for (const id of ["alarm-state", "alarm-severity", "alarm-kind"]) byId(id).addEventListener("change", () => this.reload());
     byId("alarm-scope").addEventListener("change", () => this.reload());
+    byId("alarm-text").addEventListener("input", () => this.search());
     byId("alarm-more").addEventListener("click", () => this.reload({ more: true }));
   }
 
   filters() {
     const state = { active: ["raised", "acknowledged"], raised: ["raised"], all: [] }[byId("alarm-state").value];
     const feeder = byId("alarm-scope").value === "this" ? this.feeder : null;
-    return { state, kind: byId("alarm-kind").value, feeder };
+    return { state, severity: byId("alarm-severity").value, kind: byId("alarm-kind").value, feeder, text: byId("alarm-text").value.trim() };
+  }
+
+  // The service searches: several letters, or several events, cause one request.
+  search() {
+    this.wanted ??= setTimeout(() => { this.wanted = null; this.reload(); }, SOON_MS);
   }
 
   watch(feeder) {
@@ -119,11 +126,10 @@ export class Alarms {
   }
 
   async load({ more = false } = {}) {
-    const { state, kind, feeder } = this.filters();
+    const { state, ...others } = this.filters();
     const query = new URLSearchParams({ limit: PAGE });
     for (const value of state) query.append("state", value);
-    if (kind) query.set("kind", kind);
-    if (feeder) query.set("feeder", feeder);
+    for (const [name, value] of Object.entries(others)) if (value) query.set(name, value);
     if (more && this.next) query.set("cursor", this.next);
     this.turn += 1;
     const { turn } = this;
@@ -180,13 +186,14 @@ export class Alarms {
 
   // Alarms outside of the filters are not kept: the service has them.
   put(alarm) {
-    if (this.fits(alarm)) this.alarms.set(alarm.id, alarm);
-    else this.alarms.delete(alarm.id);
+    if (!this.fits(alarm)) this.alarms.delete(alarm.id);
+    else if (this.filters().text && !this.alarms.has(alarm.id)) this.search();
+    else this.alarms.set(alarm.id, alarm);
   }
 
   fits(alarm) {
-    const { state, kind, feeder } = this.filters();
-    return (!state.length || state.includes(alarm.state)) && (!kind || alarm.kind === kind) && (!feeder || alarm.feeder === feeder);
+    const { state, severity, kind, feeder } = this.filters();
+    return (!state.length || state.includes(alarm.state)) && (!severity || alarm.severity === severity) && (!kind || alarm.kind === kind) && (!feeder || alarm.feeder === feeder);
   }
 
   shown() {
