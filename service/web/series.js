@@ -92,7 +92,9 @@ export function times(since, until, most) {
   for (const day = first; day / 1000 < until; day.setDate(day.getDate() + 1)) {
     const next = new Date(day);
     next.setDate(next.getDate() + 1);
-    for (let t = day / 1000; t < Math.min(until, next / 1000); t += step) if (t >= since) found.push(t);
+    // Steps of hours are hours of the clock: it repeats one, or leaves one out, at a change.
+    const hour = step > 3600 ? (k) => new Date(day).setHours((k * step) / 3600) / 1000 : (k) => day / 1000 + k * step;
+    for (let k = 0, t = hour(0); t < Math.min(until, next / 1000); k += 1, t = hour(k)) if (t >= since) found.push(t);
   }
   return { found, step };
 }
@@ -145,7 +147,11 @@ export class Series {
     on("series-now", () => this.now());
     on("series-close", () => this.close());
     byId("series-add").addEventListener("change", (event) => this.add(event.target.value));
-    byId("series-box").addEventListener("toggle", () => this.table());
+    // Folded, the table is invisible, and screen readers have it all the same.
+    on("series-table", () => {
+      const unseen = byId("series-box").classList.toggle("unseen");
+      byId("series-table").setAttribute("aria-expanded", String(!unseen));
+    });
     this.chart = byId("series-chart");
     this.chart.addEventListener("keydown", (event) => this.key(event));
     this.chart.addEventListener("pointerdown", (event) => this.press(event));
@@ -617,7 +623,7 @@ export class Series {
 
   table() {
     const { data } = this;
-    if (!data || !byId("series-box").open) return;
+    if (!data) return;
     const each = Math.max(1, Math.ceil(data.t.length / TABLE_ROWS));
     const rows = [];
     for (let from = 0; from < data.t.length; from += each) {
