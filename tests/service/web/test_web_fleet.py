@@ -13,7 +13,7 @@ from playwright.sync_api import Page, expect
 
 from gridsec.interface import Cause
 from tests.service.asking import T0
-from tests.service.looking import DESKTOP, PHONE, Site
+from tests.service.looking import DESKTOP, LOOKS, PHONE, READABLE, Site, contrast
 
 pytestmark = pytest.mark.browser
 
@@ -43,9 +43,9 @@ def tick(site: Site, village: Any, t: float, **changes: Any) -> None:
 
 
 @pytest.mark.canary("phone")
-@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+@LOOKS
 def test_the_worst_feeder_comes_first(
-    site_of: Callable[..., Site], village: Callable[..., Any], size: dict[str, int]
+    site_of: Callable[..., Site], village: Callable[..., Any], size: dict[str, int], scheme: str
 ) -> None:
     quiet, doubtful, attacked, dark = (
         village(name, 4) for name in ("a-quiet", "b-doubtful", "c-attacked", "d")
@@ -54,7 +54,7 @@ def test_the_worst_feeder_comes_first(
     tick(site, quiet, T0)
     tick(site, doubtful, T0, cause=Cause.AMBIGUOUS)
     tick(site, attacked, T0, lies={"H1": 9.0, "H2": 9.0})
-    page = site.open(size, "/#a-quiet")
+    page = site.open(size, "/#a-quiet", color_scheme=scheme)
     expect(page.locator("#decision")).to_have_text("CLEAN")
     expect(page.locator("#fleet-rows tr")).to_have_count(4)
     assert [row.split(",")[0] for row in rows(page)] == ["C-attacked", "B-doubtful", "D", "A-quiet"]
@@ -74,9 +74,11 @@ def test_the_worst_feeder_comes_first(
     expect(page.locator("#decision")).to_have_text("ATTACKED")
     expect(page).to_have_title("ATTACKED – C-attacked, 4 customers – gridsec")
     expect(page.locator('#fleet-rows tr[aria-current="true"] th')).to_contain_text("C-attacked")
+    tick(site, attacked, T0 + 1.0, lies={"H1": 9.0, "H2": 9.0})
     tick(site, quiet, T0 + 1.0, lies={"H0": 9.0})
     expect(page).to_have_title("1 ATTACKED | ATTACKED – C-attacked, 4 customers – gridsec")
     expect(page.locator("#fleet-counts")).to_contain_text("2 attacked")
+    assert contrast(page, "#fleet-rows :is(.fleet-state, th button, td.num), #fleet-counts button") > READABLE
     width = page.evaluate("document.documentElement.scrollWidth")
     assert width <= size["width"]
 
