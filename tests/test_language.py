@@ -30,6 +30,8 @@ PUBLIC = re.compile(r"--[a-z-]+|[`\"][wW]ho[`\"]|\bwho:|[.-]who\b|(?m:^ *(?:\w+,
 They are not counted in documents, feeders and service.
 """
 
+FOREIGN = set((ROOT / "service/web/swagger").glob("swagger-ui*"))
+"""Files of another project, unchanged."""
 # Indirect questions as titles, and personal pronouns for equipment.
 LIMITS = {
     "gridsec": (0, 0),
@@ -79,7 +81,7 @@ def counts() -> dict[str, tuple[Counter[str], Counter[str]]]:
             titles[place] += sum(bool(QUESTION.match(text)) for text in documented(ast.parse(source)))
             pronouns[place] += sum(persons(text, area(path)) for text in prose(source))
         for suffix in ("*.js", "*.html", "*.css"):
-            for path in sorted((ROOT / package).rglob(suffix)):
+            for path in sorted(set((ROOT / package).rglob(suffix)) - FOREIGN):
                 out[package][1][str(path.relative_to(ROOT))] += persons(path.read_text(), package)
     for path in sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "docs").rglob("*.py")]):
         place = str(path.relative_to(ROOT))

@@ -91,18 +91,22 @@ def steps(folder: Path) -> Iterator[Steps]:
 @pytest.mark.acceptance
 def test_every_step_of_the_tutorial(tmp_path: Path) -> None:
     found = BLOCK.findall(PAGE.read_text())
-    assert len(found) == 11
+    assert len(found) == 12
     with steps(tmp_path) as running:
         for language, code in found:
             running.run(language, code)
         counted = httpx.get(f"http://{running.http}/metrics").text
-    listed, _, _, state, bad = running.said
+    listed, _, _, state, bad, opened = running.said
     assert listed.count("365.0") == 4
     meters = {meter["meter"]: meter["seen"] for meter in json.loads(state)["meters"]}
     assert len(meters) == 13
     assert all(meters.values())
     reasons = [one["reason"] for one in json.loads(bad)["readings"]]
     assert sorted(reason.partition(":")[0] for reason in reasons) == ["replayed", "signature", "signature"]
+    (incident,) = json.loads(opened)["incidents"]
+    assert (incident["kind"], incident["severity"], incident["state"], incident["meters"]) == (
+        "identity-mismatch", "major", "raised", ["m13"],
+    )  # fmt: skip
     assert re.search(r'gridsec_bad_readings_total\{[^}]*reason="signature"\} 2\.0', counted)
 
 

@@ -15,12 +15,14 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
+from service.times import UtcTwins
+
 START: Final = "0" * 64
 """Previous hash of the first entry."""
 
 
 @dataclass(frozen=True, slots=True)
-class AuditEntry:
+class AuditEntry(UtcTwins):
     """Entry of the audit log."""
 
     seq: int  # number, from 1 without gaps

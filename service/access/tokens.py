@@ -78,6 +78,13 @@ class TokenVerifier:
             raise NotAuthenticated(f"the token is not valid: {error}") from error
         return self._identity(claims)
 
+    def reachable(self) -> int:
+        """Number of the issuer's signing keys, read now. Raises IssuerUnavailable without any."""
+        try:
+            return len(self._keys().get_signing_keys(refresh=True))
+        except (jwt.PyJWKClientError, jwt.PyJWKSetError, OSError, ValueError) as error:
+            raise _unavailable(self.issuer, str(error)) from error
+
     def _key(self, token: str) -> Any:
         """Public key of a token's signature."""
         kid = str(jwt.get_unverified_header(token).get("kid", ""))

@@ -27,6 +27,7 @@ from gridsec.errors import GridsecError
 from service.alarms.conditions import AlarmKind, Severity
 from service.alarms.state_machine import AlarmState, AlarmTransition, Change, ulid
 from service.errors import IdUnknown
+from service.times import UtcTwins
 
 T = TypeVar("T")
 
@@ -91,7 +92,7 @@ def higher(one: Severity, other: Severity) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Incident:
+class Incident(UtcTwins):
     """An incident. Times are Unix seconds."""
 
     id: str  # 26 characters, the first ten sort by time; the same data give the same id
@@ -150,7 +151,7 @@ class IncidentTransition:
 
 
 @dataclass(frozen=True, slots=True)
-class IncidentEvent:
+class IncidentEvent(UtcTwins):
     """A stored change of an incident, and the incident after it.
 
     Readers page through the events by `seq` (`Store.incident_events_after`). A notification begins with the
@@ -171,9 +172,9 @@ _INCIDENT = TypeAdapter(Incident)
 _INCIDENT_EVENT = TypeAdapter(IncidentEvent)
 
 
-def incident_json(incident: Incident) -> dict[str, Any]:
-    """Return the incident as the JSON object of REST and the database."""
-    found: dict[str, Any] = _INCIDENT.dump_python(incident, mode="json")
+def incident_json(incident: Incident, *, stored: bool = False) -> dict[str, Any]:
+    """Return the incident as the JSON object of REST, or (`stored`) without twins of times."""
+    found: dict[str, Any] = _INCIDENT.dump_python(incident, mode="json", round_trip=stored)
     return found
 
 
@@ -232,7 +233,7 @@ class WrongTime(GridsecError):
 
 
 @dataclass(frozen=True, slots=True)
-class Shelf:
+class Shelf(UtcTwins):
     """Suppression of the notifications of alarms. Times are Unix seconds.
 
     It applies to the alarms of the feeder that have all given ones of `alarm`, `incident`, `meter`, `kind`.
@@ -259,7 +260,7 @@ class Shelf:
 
 
 @dataclass(frozen=True, slots=True)
-class PlannedWork:
+class PlannedWork(UtcTwins):
     """Planned work on a feeder: its alarms are marked and do not notify. Times are Unix seconds."""
 
     id: str

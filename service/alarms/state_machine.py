@@ -29,6 +29,7 @@ from pydantic import Field, TypeAdapter
 from gridsec.errors import GridsecError, InputInvalid, Problem
 from service.alarms.conditions import AlarmEvidence, AlarmKind, Condition, Severity, conditions
 from service.errors import IdUnknown
+from service.times import UtcTwins
 
 INCIDENT_S = 60.0
 """Largest distance in time of alarms of one incident, s; two ticks if these are longer."""
@@ -94,7 +95,7 @@ class RaisedAgain(GridsecError):
 
 
 @dataclass(frozen=True, slots=True)
-class Alarm:
+class Alarm(UtcTwins):
     """An alarm. Times are Unix seconds."""
 
     id: str  # 26 characters, the first ten sort by time; the same data give the same id
@@ -146,9 +147,9 @@ class AlarmTransition:
 _ALARM = TypeAdapter(Alarm)
 
 
-def to_json(alarm: Alarm) -> dict[str, Any]:
-    """Return the alarm as the JSON object of REST, zenoh and the database."""
-    found: dict[str, Any] = _ALARM.dump_python(alarm, mode="json")
+def to_json(alarm: Alarm, *, stored: bool = False) -> dict[str, Any]:
+    """Return the alarm as the JSON object of REST and zenoh, or (`stored`) without twins of times."""
+    found: dict[str, Any] = _ALARM.dump_python(alarm, mode="json", round_trip=stored)
     return found
 
 

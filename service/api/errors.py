@@ -61,15 +61,16 @@ class HeadAsGet:
 # --- Problems and request checks ---
 
 
-_CSP = (
+SECURITY_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-_HEADERS = [
-    (b"content-security-policy", _CSP.encode()),
-    (b"x-content-type-options", b"nosniff"),
-    (b"referrer-policy", b"no-referrer"),
-]
+"""Content security policy of every response without its own: the page loads nothing from elsewhere."""
+_HEADERS = {
+    b"content-security-policy": SECURITY_POLICY.encode(),
+    b"x-content-type-options": b"nosniff",
+    b"referrer-policy": b"no-referrer",
+}
 
 
 def problem(
@@ -152,7 +153,9 @@ class Guard:
 
         async def guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
-                message = {**message, "headers": [*message.get("headers", []), *_HEADERS]}
+                own = dict(message.get("headers", []))
+                missing = [each for each in _HEADERS.items() if each[0] not in own]
+                message = {**message, "headers": [*message.get("headers", []), *missing]}
             await send(message)
 
         if strange := self.stranger(request):

@@ -80,9 +80,9 @@ def list_feeders(
     limit: Annotated[int | None, Query(ge=0, le=5000, description="Without it all; 0: numbers only.")] = None,
 ) -> models.Feeders:
     """All feeders with the latest verdict of each, or a page of them, the worst first."""
-    alarms = backend.store.alarms_by_feeder()
+    alarms, incidents = backend.store.alarms_by_feeder(), backend.store.incidents_by_feeder()
     found = [
-        overview.standing(fields, backend.summary(name), alarms.get(name))
+        overview.standing(fields, backend.summary(name), alarms.get(name), incidents.get(name, 0))
         for fields in backend.feeders()
         if caller.sees(name := fields["name"])
     ]
@@ -96,7 +96,8 @@ def get_feeder(
 ) -> Any:
     """A feeder: its tree, and the columns of its files."""
     fields = _detail(backend, feeder)
-    return unchanged(response, f'"{fields["revision"]}"', if_none_match) or fields
+    tag = f'"{fields["revision"]}-{fields.get("max_attacked", 0)}"'
+    return unchanged(response, tag, if_none_match) or fields
 
 
 @router.put("/{feeder}", response_model=models.FeederDetail, dependencies=[Depends(json_only)])

@@ -1,4 +1,7 @@
-"""The operator guide as a page of the service: `docs/operator-guide.md` as HTML with named sections."""
+"""Pages beside the web page: the operator guide, and Swagger UI of the OpenAPI description.
+
+The guide is `docs/operator-guide.md` as HTML with named sections. Files of Swagger UI are in `web/swagger`.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +15,14 @@ from markdown_it import MarkdownIt
 from starlette.requests import Request
 from starlette.responses import HTMLResponse
 
+from service.api.errors import SECURITY_POLICY
+
 ADDRESS: Final = "/operator-guide"
-"""Path of the page, as in `web/dom.js`."""
+"""Path of the guide, as in `web/dom.js`."""
+DOCS: Final = "/api/v1/docs"
+"""Path of Swagger UI, beside the OpenAPI description."""
+DOCS_POLICY: Final = SECURITY_POLICY.replace("img-src 'self'", "img-src 'self' data:")
+"""Content security policy of Swagger UI: the icons of its style sheet are `data:` addresses."""
 _HERE = Path(__file__).parent
 _FILES = (_HERE.with_name("web") / "operator-guide.md", _HERE.parents[1] / "docs" / "operator-guide.md")
 """The guide of an installed package, and of a source tree."""
@@ -23,6 +32,16 @@ _PAGE = """<!doctype html>
 <meta name="color-scheme" content="light dark"><title>Operator guide – gridsec</title>
 <link rel="icon" href="icon.svg" type="image/svg+xml"><link rel="stylesheet" href="style.css"></head>
 <body><article class="guide">{}</article></body></html>
+"""
+
+_DOCS = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1"><title>REST interface – gridsec</title>
+<link rel="icon" href="../../icon.svg" type="image/svg+xml">
+<link rel="stylesheet" href="../../swagger/swagger-ui.css"></head>
+<body><div id="swagger-ui"></div>
+<script src="../../swagger/swagger-ui-bundle.js"></script><script src="../../swagger/open.js"></script>
+</body></html>
 """
 
 
@@ -51,3 +70,9 @@ def page() -> str:
 def show(_: Request) -> HTMLResponse:
     """Answer a request of the guide."""
     return HTMLResponse(page(), headers={"Cache-Control": "no-cache"})
+
+
+def show_docs(_: Request) -> HTMLResponse:
+    """Answer a request of Swagger UI."""
+    headers = {"Cache-Control": "no-cache", "Content-Security-Policy": DOCS_POLICY}
+    return HTMLResponse(_DOCS, headers=headers)

@@ -35,6 +35,7 @@ from service.report.report import FeederReport, MeterState, ModelOnly
 from service.store import AlarmEvent
 from service.store.incidents import Said
 from service.store.schema import CommissioningEvent
+from service.times import UtcTwins
 
 RENAMED = {
     "Alarm": "AlarmModel",
@@ -49,6 +50,10 @@ Line = Annotated[
         strip_whitespace=True, min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]*$"
     ),
 ]
+MaxAttacked = Annotated[
+    int, Field(description="Number of manipulated meters that the design identifies; 0 without a design.")
+]
+StatedMaxAttacked = Annotated[int, Field(description="`max_attacked` of the feeder's file.")]
 Id = Annotated[str, StringConstraints(pattern=r"^[0-9A-Z]{26}$")]
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 Text = Annotated[
@@ -83,7 +88,7 @@ class State(FeederReport):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MeterNow(MeterState):
+class MeterNow(UtcTwins, MeterState):
     """One meter at the latest tick, with its feeder and the verdict."""
 
     feeder: str
@@ -116,7 +121,7 @@ class CommissioningEvents(BaseModel):
     events: list[CommissioningEvent]
 
 
-class FeederSummary(BaseModel):
+class FeederSummary(UtcTwins, BaseModel):
     """A feeder in the list."""
 
     model_config = ConfigDict(extra="allow")
@@ -126,6 +131,8 @@ class FeederSummary(BaseModel):
     t: float | None = Field(default=None, description="Latest tick; null before the first one.")
     age_s: float | None = Field(default=None, description="Age of that tick by the service's clock, s.")
     patience_s: float | None = Field(default=None, description="Age beyond which a tick is stale, s.")
+    max_attacked: MaxAttacked = 0
+    max_attacked_stated: StatedMaxAttacked = 0
     ticks_skipped: int | None = Field(
         default=None, description="Number of skipped ticks since the start; null if not monitored."
     )
@@ -152,6 +159,7 @@ class FeederSummary(BaseModel):
     silent: int = Field(default=0, description="Silent meters of customers at that tick.")
     alarms: int = Field(default=0, description="Active alarms.")
     raised: int = Field(default=0, description="Active alarms without an acknowledgement.")
+    incidents: int = Field(default=0, description="Open incidents: those with an active alarm.")
 
 
 class Feeders(BaseModel):
@@ -205,8 +213,11 @@ class FeederDetail(BaseModel):
     tick_s: float = 1.0
     patience_s: float | None = Field(default=None, description="Age beyond which a state is stale, s.")
     revision: str = Field(
-        description="Digest of all other fields; a state with another one does not belong to them."
+        description="Digest of all other fields but `max_attacked`; a state with another one does not belong "
+        "to them."
     )
+    max_attacked: MaxAttacked = 0
+    max_attacked_stated: StatedMaxAttacked = 0
     layout: Layout
     tables: dict[str, Any]
 
@@ -259,7 +270,7 @@ Who = Annotated[
 ]
 
 
-class Session(BaseModel):
+class Session(UtcTwins, BaseModel):
     """Identity of the caller."""
 
     name: str
@@ -289,7 +300,7 @@ class Targets(BaseModel):
     targets: list[TargetStatus]
 
 
-class Letter(BaseModel):
+class Letter(UtcTwins, BaseModel):
     """Message that was given up."""
 
     id: int = Field(description="Number of the dead letter.")
@@ -484,7 +495,7 @@ class IncidentEvents(BaseModel):
     next: int | None = Field(description="`after` of the next page; null on the last one.")
 
 
-class HandOver(BaseModel):
+class HandOver(UtcTwins, BaseModel):
     """State of the shift: open incidents, shelves, planned work, and comments since a time."""
 
     t: float = Field(description="Time of the response, Unix s.")
@@ -538,7 +549,7 @@ class Recommissioning(BaseModel):
         return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}}}}
 
 
-class HistoryPoint(BaseModel):
+class HistoryPoint(UtcTwins, BaseModel):
     """A kept tick of a feeder."""
 
     t: float
@@ -597,7 +608,7 @@ class MeterSeries(BaseModel):
     suspect: list[bool] = Field(description="The verdict of a stored tick names the meter.")
 
 
-class AlarmOccurrence(BaseModel):
+class AlarmOccurrence(UtcTwins, BaseModel):
     """One occurrence of an alarm."""
 
     id: str
@@ -633,7 +644,7 @@ class Series(BaseModel):
     more_alarms: bool = Field(description="There are more; `alarms` are the newest ones.")
 
 
-class RejectedReading(BaseModel):
+class RejectedReading(UtcTwins, BaseModel):
     """A rejected reading."""
 
     t: float

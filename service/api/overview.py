@@ -35,6 +35,7 @@ class Standing:
     now: Mapping[str, Any]  # numbers of the latest tick, as of `Backend.summary`
     alarms: AlarmCounts
     status: FeederStatus
+    incidents: int = 0  # open ones
 
     @property
     def name(self) -> str:
@@ -54,13 +55,16 @@ class Standing:
     def summary(self) -> models.FeederSummary:
         """Return the entry of the list."""
         counts = {"status": self.status, "alarms": self.alarms.active, "raised": self.alarms.raised}
+        counts["incidents"] = self.incidents
         return models.FeederSummary.model_validate({**self.fields, **counts, **self.now})
 
 
-def standing(fields: Mapping[str, Any], now: Mapping[str, Any], alarms: AlarmCounts | None) -> Standing:
-    """Return the state of a feeder from its fields, the numbers of its latest tick, and its alarms."""
+def standing(
+    fields: Mapping[str, Any], now: Mapping[str, Any], alarms: AlarmCounts | None, incidents: int = 0
+) -> Standing:
+    """Return the state of a feeder from its fields, its latest tick, its alarms and its open incidents."""
     status = status_of(now, fields.get("patience_s"), failed=fields.get("phase") == "failed")
-    return Standing(fields, now, alarms or _NONE, status)
+    return Standing(fields, now, alarms or _NONE, status, incidents)
 
 
 def page(

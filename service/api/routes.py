@@ -78,6 +78,7 @@ def create_api(
     for router in (feeders.router, *alarms.routers, *system.routers):
         app.include_router(router)
     app.add_route(guide.ADDRESS, guide.show, include_in_schema=False)
+    app.add_route(guide.DOCS, guide.show_docs, include_in_schema=False)
     app.mount("/", _Web(directory=_WEB, html=True), name="web")
     _describe(app)
     app.state.queries = _queries(app.openapi())

@@ -23,7 +23,19 @@ from urllib.parse import urlsplit
 import typer
 
 from service.cli.console import FAILED, say
-from service.cli.serve import Database, Endpoints, EstimatorName, Feeders, Http, Listen, Notify
+from service.cli.serve import (
+    Config,
+    Database,
+    Endpoints,
+    EstimatorName,
+    Feeders,
+    Http,
+    Listen,
+    MeterKeysFile,
+    Notify,
+    OidcIssuer,
+    OidcJwks,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -80,6 +92,10 @@ def doctor(
     feeder: Feeders = None,
     estimator: EstimatorName = None,
     notify: Notify = None,
+    zenoh_config: Config = None,
+    meter_keys: MeterKeysFile = None,
+    oidc_issuer: OidcIssuer = None,
+    oidc_jwks: OidcJwks = None,
 ) -> None:
     """Check everything that `gridsec serve` needs; exit code 1 if a line is FAIL.
 
@@ -96,6 +112,10 @@ def doctor(
             "feeders": tuple(feeder) if feeder else None,
             "estimator": estimator,
             "notify": notify,
+            "zenoh_config": zenoh_config,
+            "meter_keys": meter_keys,
+            "oidc_issuer": oidc_issuer,
+            "oidc_jwks": oidc_jwks,
         }
     )
     failed = False
@@ -114,6 +134,9 @@ def examine(chosen: Settings) -> Iterator[Finding]:
     yield from _clock(None if state is None else state.newest, time.time())
     yield _http(chosen.http)
     yield from _zenoh(chosen)
+    yield from _certificates(chosen.zenoh_config, time.time())
+    yield from _meter_keys(chosen)
+    yield from _issuer(chosen)
     meters, feeders = _feeders(chosen, {} if state is None else state.feeders)
     yield from feeders
     yield _descriptors(meters)
@@ -223,6 +246,56 @@ def _zenoh(chosen: Settings) -> Iterator[Finding]:
         except BusUnavailable as error:
             text = f"{str(error).rstrip('.!')}; start the router there, or correct --zenoh-connect"
             yield Finding(Level.FAIL, "zenoh", text)
+
+
+def _certificates(file: Path | None, now: float) -> Iterator[Finding]:
+    """Findings about the files that a zenoh configuration names."""
+    from service.access.tls_files import check_files
+    from service.ingest.queues import BusConfig, BusUnavailable
+    from service.ingest.zenoh_bus import tls_files
+
+    if file is None:
+        return
+    try:
+        files = tls_files(BusConfig(file=file))
+    except BusUnavailable as error:
+        yield Finding(Level.FAIL, "certificate", str(error))
+        return
+    for found in check_files(files, now):
+        if found.problem or found.expires is None:
+            yield Finding(Level.FAIL, "certificate", f"{found.path}: {found.problem}")
+            continue
+        text = f"{found.path}: expires on {datetime.fromtimestamp(found.expires, UTC):%Y-%m-%d}"
+        yield Finding(Level.NOTE if found.expires_soon(now) else Level.OK, "certificate", text)
+
+
+def _meter_keys(chosen: Settings) -> Iterator[Finding]:
+    """Finding about the table of the meters' keys, or one for each wrong row."""
+    from service.settings import SettingsInvalid
+
+    try:
+        keys = chosen.read_meter_keys()
+    except SettingsInvalid as error:
+        for problem in error.problems:
+            yield Finding(Level.FAIL, "meter keys", " ".join(problem.split()))
+        return
+    if keys is not None:
+        yield Finding(Level.OK, "meter keys", f"{chosen.meter_keys}: {len(keys.entries)} meters")
+
+
+def _issuer(chosen: Settings) -> Iterator[Finding]:
+    """Finding about the issuer of tokens: its keys are read."""
+    from service.access.identity import IssuerUnavailable
+    from service.access.tokens import TokenVerifier
+
+    if not chosen.oidc_issuer:
+        return
+    try:
+        count = TokenVerifier(chosen.oidc_issuer, chosen.oidc_audience, chosen.oidc_jwks).reachable()
+    except IssuerUnavailable as error:
+        yield Finding(Level.FAIL, "issuer", " ".join(str(error).split()))
+        return
+    yield Finding(Level.OK, "issuer", f"{chosen.oidc_issuer}: {count} signing keys")
 
 
 def _feeders(chosen: Settings, stored: Mapping[str, str]) -> tuple[int, list[Finding]]:

@@ -29,6 +29,7 @@ from gridsec.estimators.sequential import (
 from service.report.report import LearningReport, StalledMeter
 from service.store.schema import CommissioningChange, CommissioningEvent
 from service.store.state_codec import KeptInvalid, StateSnapshot, decode, encode, fingerprint
+from service.times import UtcTwins
 
 SAVE_S = 60.0
 """Interval of storing the learning in progress, s; all other changes are stored at once."""
@@ -53,7 +54,7 @@ class Stage(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class MeterCommissioning:
+class MeterCommissioning(UtcTwins):
     """Commissioning of one meter: its fixed error."""
 
     meter: str
@@ -103,7 +104,7 @@ class MeterCommissioning:
 
 
 @dataclass(frozen=True, slots=True)
-class CommissioningProgress:
+class CommissioningProgress(UtcTwins):
     """Commissioning of a feeder: learning of its meters' fixed errors."""
 
     feeder: str

@@ -197,7 +197,7 @@ class FeederMonitor:
     ) -> None:
         self.site = site
         self.name = site.feeder.name
-        self.max_attacked = site.tables.meta.monitor.max_attacked
+        self.max_attacked = 0  # M of the design; none is guaranteed without one
         self.aligner = Aligner(site.meter_ids, rules)
         self.book = book
         self.commissioning = commissioning or FeederCommissioning(site)
@@ -250,6 +250,7 @@ class FeederMonitor:
     def fail(self, problem: str) -> None:
         """End monitoring; ticks continue and are undecided."""
         self._watcher = self._state = None
+        self.max_attacked = 0
         self.phase, self.problem = Phase.FAILED, problem
 
     def break_down(self, defect: Exception) -> None:

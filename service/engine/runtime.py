@@ -338,6 +338,7 @@ class Runtime:
         watched = [
             {
                 **feeder_info.summary(monitor.site),
+                "max_attacked": monitor.max_attacked,
                 "phase": str(monitor.phase),
                 "problem": monitor.problem or None,
                 "patience_s": monitor.patience_s,
@@ -355,7 +356,10 @@ class Runtime:
     def feeder(self, name: str) -> dict[str, Any] | None:
         """Return all properties of a feeder, or None."""
         monitor = self._engine.monitors.get(name)
-        return None if monitor is None else feeder_info.detail(monitor.site, monitor.patience_s)
+        if monitor is None:
+            return None
+        fields = feeder_info.detail(monitor.site, monitor.patience_s)
+        return {**fields, "max_attacked": monitor.max_attacked}
 
     def known(self, name: str) -> bool:
         """True if a feeder is monitored."""

@@ -133,6 +133,22 @@ def endpoints(config: BusConfig) -> tuple[str, ...]:
     return tuple(found)
 
 
+def tls_files(config: BusConfig) -> dict[str, str]:
+    """Return the certificate and key files of a configuration by their names in `transport/link/tls`.
+
+    Raises
+    ------
+    BusUnavailable
+        If the configuration is wrong.
+    """
+    section: dict[str, Any] = json.loads(_config(config).get_json("transport/link/tls")) or {}
+    return {
+        name: path
+        for name, path in section.items()
+        if isinstance(path, str) and name.endswith(("_certificate", "_private_key"))
+    }
+
+
 class Bus:
     """zenoh session of the service, as a context manager.
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from datetime import UTC, datetime
 from typing import Any, Final
 
 from service.alarms.incidents import IncidentChange
 from service.alarms.state_machine import Severity
 from service.notify.notices import Notice
+from service.times import rfc3339
 
 PATH: Final = "/api/v2/alerts"
 HOLD: Final = 4.0
@@ -55,9 +55,9 @@ def alerts(
         return {
             "labels": {**own, "severity": severity},
             "annotations": annotations,
-            "startsAt": _rfc3339(notice.began),
+            "startsAt": rfc3339(notice.began),
             # Alertmanager refuses an alert that ends before its start.
-            "endsAt": _rfc3339(max(end, notice.began)),
+            "endsAt": rfc3339(max(end, notice.began)),
             **({"generatorURL": url} if url else {}),
         }
 
@@ -77,7 +77,3 @@ def newest(notices: Iterable[Notice]) -> list[Notice]:
 def body_of(alerts: Iterable[Mapping[str, Any]]) -> str:
     """Return the body of a request."""
     return json.dumps(list(alerts), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-
-
-def _rfc3339(t: float) -> str:
-    return datetime.fromtimestamp(t, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -36,6 +36,7 @@ from service.notify.post import Cancel, Response, post
 from service.notify.targets import Alertmanager, Target, Targets, Webhook
 from service.store import StoreUnavailable
 from service.store.deliveries import DeadLetter, DeliveryStore, Position
+from service.times import UtcTwins
 
 PAGE: Final = 100
 """Number of events in one read."""
@@ -142,7 +143,7 @@ def channel_of(
 
 
 @dataclass(frozen=True, slots=True)
-class TargetStatus:
+class TargetStatus(UtcTwins):
     """State of a target. Times are Unix seconds."""
 
     name: str

@@ -73,7 +73,7 @@ def numbers(report: FeederReport, age_s: float) -> dict[str, Any]:
 
 
 def summary(site: Site) -> dict[str, Any]:
-    """Return a feeder's entry in the list of feeders."""
+    """Return a feeder's entry in the list of feeders, as far as its files determine it."""
     settings = site.tables.meta.monitor
     return {
         "name": site.feeder.name,
@@ -82,7 +82,7 @@ def summary(site: Site) -> dict[str, Any]:
         "meters": len(site.meter_ids),
         "inverters": int(site.droop.customer.size),
         "estimator": settings.estimator,
-        "max_attacked": settings.max_attacked,
+        "max_attacked_stated": settings.max_attacked,
         "tick_s": settings.tick_s,
     }
 
@@ -93,7 +93,7 @@ def revision(fields: Mapping[str, Any]) -> str:
 
 
 def detail(site: Site, patience_s: float) -> dict[str, Any]:
-    """Return all properties of a feeder: limits, tree with positions, tables, and their `revision`.
+    """Return all properties of a feeder's files: limits, tree with positions, tables, and their `revision`.
 
     Reports older than `patience_s`, s, are stale.
     """

@@ -24,6 +24,7 @@ from gridsec.interface import Cause, Decision, Estimate, Verdict
 from service.ingest.align import Tick
 from service.ingest.reading import P_KW, Q_KVAR, T_POWER, V_VOLT, T
 from service.report.data_errors import DataErrorReport
+from service.times import UtcTwins
 
 Phase: TypeAlias = Literal["a", "b", "c"]
 
@@ -503,7 +504,7 @@ class Silence:
 
 
 @dataclass(frozen=True, slots=True)
-class DisplayedVerdict:
+class DisplayedVerdict(UtcTwins):
     """Verdict after the delays of the alarms: the raw one may change at every tick."""
 
     verdict: Decision
@@ -518,7 +519,7 @@ class DisplayedVerdict:
 
 
 @dataclass(frozen=True, slots=True)
-class FeederReport:
+class FeederReport(UtcTwins):
     """A feeder at one tick, as REST's `state` and the zenoh key `estimate` show it."""
 
     feeder: str
@@ -526,7 +527,9 @@ class FeederReport:
     verdict: Decision
     reason: str
     cause: Cause
-    max_attacked: int
+    max_attacked: Annotated[
+        int, Field(description="Number of manipulated meters that the design identifies; 0 without a design.")
+    ]
     meters: tuple[MeterState, ...]
     buses: tuple[BusState, ...]
     silent: tuple[Silence, ...]

@@ -32,6 +32,7 @@ from service.alarms.incidents import (
 )
 from service.alarms.state_machine import Alarm, AlarmState, AlarmTransition, Change, from_json
 from service.store.schema import ALARM, EVENT, INCIDENT, INCIDENT_EVENT, SHELF, WORK
+from service.times import UtcTwins
 
 AT_ONCE = 5000
 """Largest number of values in one statement."""
@@ -53,7 +54,7 @@ class AlarmMark:
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class Said(UtcTwins):
     """A comment of an operator."""
 
     t: float
@@ -277,12 +278,13 @@ def _row(incident: Incident) -> dict[str, Any]:
         "planned_until": incident.planned_until,
         "assigned_to": incident.assigned_to,
         "words": " ".join(words).lower(),
-        "data": json.dumps(incident_json(incident), allow_nan=False),
+        "data": json.dumps(incident_json(incident, stored=True), allow_nan=False),
     }
 
 
 def _suppression(one: Shelf | PlannedWork, t_next: float | None, kind: TypeAdapter[Any]) -> dict[str, Any]:
-    return {"id": one.id, "feeder": one.feeder, "t_next": t_next, "data": kind.dump_json(one).decode()}
+    data = kind.dump_json(one, round_trip=True).decode()
+    return {"id": one.id, "feeder": one.feeder, "t_next": t_next, "data": data}
 
 
 def _put_event(connection: sa.Connection, item: IncidentTransition) -> int:
@@ -294,7 +296,7 @@ def _put_event(connection: sa.Connection, item: IncidentTransition) -> int:
         "who": item.who,
         "comment": item.comment,
         "notify": item.notify,
-        "data": json.dumps(incident_json(item.incident), allow_nan=False),
+        "data": json.dumps(incident_json(item.incident, stored=True), allow_nan=False),
         "published": False,
     }
     statement = INCIDENT_EVENT.insert().values(row).returning(INCIDENT_EVENT.c.seq)
@@ -381,6 +383,13 @@ class IncidentReader:
             query = query.where(i.feeder.in_(among))
         with self._read() as connection:
             return int(connection.execute(query).scalar_one())
+
+    def incidents_by_feeder(self) -> dict[str, int]:
+        """Number of incidents with an active alarm, of the feeders that have any."""
+        i = INCIDENT.c
+        query = sa.select(i.feeder, sa.func.count()).where(i.state != str(IncidentState.CLEARED))
+        with self._read() as connection:
+            return {name: int(count) for name, count in connection.execute(query.group_by(i.feeder))}
 
     def incident_events(self, incident_id: str, after: int = 0, *, limit: int = 1000) -> list[IncidentEvent]:
         """Return the events of an incident, oldest first. `after` restricts to a higher number."""

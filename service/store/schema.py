@@ -14,6 +14,7 @@ from pydantic import Field
 
 from gridsec.errors import GridsecError
 from service.alarms.state_machine import Alarm, Change, from_json
+from service.times import UtcTwins
 
 
 class CommissioningChange(StrEnum):
@@ -25,7 +26,7 @@ class CommissioningChange(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class CommissioningEvent:
+class CommissioningEvent(UtcTwins):
     """One change of a commissioning."""
 
     feeder: Annotated[str, Field(exclude=True)]
@@ -79,7 +80,7 @@ class LeaseLost(StoreUnavailable):
 
 
 @dataclass(frozen=True, slots=True)
-class AlarmEvent:
+class AlarmEvent(UtcTwins):
     """One event of an alarm, and the alarm after it."""
 
     seq: int  # increases in the order of commits and is never reused

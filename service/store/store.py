@@ -701,7 +701,7 @@ class Store(Reader):
 
     def _put_transition(self, connection: sa.Connection, transition: AlarmTransition) -> int:
         alarm = transition.alarm
-        data = json.dumps(to_json(alarm), allow_nan=False)
+        data = json.dumps(to_json(alarm, stored=True), allow_nan=False)
         row = {
             "id": alarm.id,
             "kind": str(alarm.kind),

@@ -132,14 +132,19 @@ class InProcess:
 
 @contextmanager
 def service(
-    folder: Path, feeders: Iterable[str] = (FEEDER,), *, wall: Callable[[], float] = time.time, **given: Any
+    folder: Path,
+    feeders: Iterable[str] = (FEEDER,),
+    *,
+    wall: Callable[[], float] = time.time,
+    client: BusConfig | None = None,
+    **given: Any,
 ) -> Iterator[InProcess]:
-    """Run a service until the block ends."""
+    """Run a service until the block ends. With `client`, the meters' session, it needs `zenoh_config`."""
     zenoh = f"tcp/127.0.0.1:{free_port()}"
     chosen = settings(
         {
             "feeders": tuple(feeders),
-            "zenoh_listen": (zenoh,),
+            "zenoh_listen": (zenoh,) if client is None else (),
             "http": "127.0.0.1:0",
             "database": f"sqlite:///{folder / 'gridsec.db'}",
             **given,
@@ -165,7 +170,7 @@ def service(
         assert up.wait(PATIENCE_S)
         if "error" in found:
             raise found["error"]
-        config = BusConfig("client", connect=(zenoh,))
+        config = client or BusConfig("client", connect=(zenoh,))
         with (
             httpx.Client(base_url=found["running"].url, timeout=10.0) as http,
             MeterClient(config, chosen.prefix) as meters,

@@ -421,5 +421,21 @@ def test_a_feeder_that_cannot_be_watched_is_undecided_and_stops_no_other(
         ready = live.http.get("/readyz")
         assert ready.status_code == 503
         assert "impossible" in ready.text
-        phases = {f["name"]: f["phase"] for f in live.get("/api/v1/feeders")["feeders"]}
-        assert phases == {FEEDER: "watching", "impossible": "failed"}
+        listed = {f["name"]: f for f in live.get("/api/v1/feeders")["feeders"]}
+        assert {f["name"]: f["phase"] for f in listed.values()} == {
+            FEEDER: "watching",
+            "impossible": "failed",
+        }
+        # M of the design is one number everywhere; that of the file is another one.
+        guaranteed, stated = (
+            {FEEDER: live.state()["max_attacked"], "impossible": 0},
+            {FEEDER: 2, "impossible": 7},
+        )
+        assert guaranteed[FEEDER] > stated[FEEDER]
+        assert state["max_attacked"] == 0
+        for one in (*listed.values(), *(live.get(f"/api/v1/feeders/{name}") for name in listed)):
+            assert one["max_attacked"] == guaranteed[one["name"]]
+            assert one["max_attacked_stated"] == stated[one["name"]]
+        before = live.http.get(f"/api/v1/feeders/{FEEDER}")
+        known = {"If-None-Match": before.headers["etag"]}
+        assert live.http.get(f"/api/v1/feeders/{FEEDER}", headers=known).status_code == 304

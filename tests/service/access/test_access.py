@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import sqlite3
-import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import jwt
 import pytest
-from cryptography.hazmat.primitives.asymmetric import ec, rsa
+from cryptography.hazmat.primitives.asymmetric import rsa
 from hypothesis import given
 from hypothesis import strategies as st
-from jwt.algorithms import ECAlgorithm, RSAAlgorithm
 
 from service.access.audit import START, AuditEntry, broken, chained
 from service.access.identity import (
@@ -34,9 +29,10 @@ from service.access.identity import (
 )
 from service.access.keys import create, matches, parse
 from service.access.tokens import TokenVerifier
-from service.store.access import SESSION_S, AccessStore
+from service.store.access import AccessStore
 from service.store.schema import StoreUnavailable
 from tests.codes import refused
+from tests.service.issuer import Issuer, issuing
 
 NOW = 1_795_212_000.0
 
@@ -105,28 +101,10 @@ def test_expiry_and_revocation() -> None:
     assert replace(record, expires=None).ended(NOW + 1e9) is None
 
 
-def test_keys_and_sessions_in_the_database(store: AccessStore, tmp_path: Path) -> None:
-    assert not store.any_key()
-    text, record = create("Ada", Role.OPERATOR, frozenset({"north", "south"}), NOW, NOW + 100.0)
+def test_the_file_of_keys_holds_no_secret_and_is_private(store: AccessStore, tmp_path: Path) -> None:
+    text, record = create("Ada", Role.OPERATOR, None, NOW, NOW + 100.0)
     store.add_key(record)
-    assert store.any_key()
-    assert store.key(record.id) == record
-    assert store.keys() == [record]
-    assert store.key("0000000000") is None
-    end = store.open_session("cookie", record.id, NOW)
-    assert end == NOW + SESSION_S
-    assert store.session("cookie", NOW + SESSION_S - 1.0) == record
-    assert store.session("cookie", NOW + SESSION_S) is None
-    assert store.session("other", NOW) is None
-    assert store.revoke(record.id, NOW + 5.0)
-    assert not store.revoke(record.id, NOW + 6.0)
-    kept = store.session("cookie", NOW + 7.0)
-    assert kept is not None
-    assert kept.ended(NOW + 7.0) == "the key is revoked"
-    store.close_session("cookie")
-    assert store.session("cookie", NOW + 7.0) is None
-    # A revoked key does not open the service again.
-    assert store.any_key()
+    store.open_session("cookie", record.id, NOW)
     content = (tmp_path / "grid.db.access").read_bytes()
     assert text.encode() not in content
     assert text.split("_", 2)[2].encode() not in content
@@ -199,77 +177,13 @@ def test_a_rewritten_log_is_found_by_a_kept_entry() -> None:
     assert other[0].previous == START
 
 
-def test_entries_of_many_writers_are_one_chain(store: AccessStore, tmp_path: Path) -> None:
-    """Two stores on one database, eight threads."""
-    with AccessStore(f"sqlite:///{tmp_path}/grid.db") as second, ThreadPoolExecutor(8) as pool:
-        both = (store, second)
-        jobs = [
-            pool.submit(both[k % 2].append, NOW + k, f"w{k}", "key 1", "PUT", "feeder") for k in range(60)
-        ]
-        for job in jobs:
-            job.result()
-    entries = store.audit()
-    assert [each.seq for each in entries] == list(range(1, 61))
-    assert broken(entries) is None
-    assert {each.identity for each in entries} == {f"w{k}" for k in range(60)}
-    assert [each.seq for each in store.audit(after=10, limit=5)] == [11, 12, 13, 14, 15]
-    with sqlite3.connect(tmp_path / "grid.db.access") as raw:
-        raw.execute("UPDATE audit SET identity = 'Eve' WHERE seq = 30")
-    raw.close()
-    assert broken(store.audit()) == "entry 30 was changed after it was written"
-
-
 # --------------------------------------------------------------------- tokens
-
-
-class Issuer(ThreadingHTTPServer):
-    """Issuer with a discovery document and its public keys."""
-
-    def __init__(self) -> None:
-        super().__init__(("127.0.0.1", 0), _Answers)
-        self.url = f"http://127.0.0.1:{self.server_port}"
-        self.rsa = rsa.generate_private_key(public_exponent=65537, key_size=2048)
-        self.ec = ec.generate_private_key(ec.SECP256R1())
-        self.documents = {
-            "/.well-known/openid-configuration": {"issuer": self.url, "jwks_uri": f"{self.url}/keys"},
-            "/keys": {
-                "keys": [
-                    {**json.loads(RSAAlgorithm.to_jwk(self.rsa.public_key())), "kid": "r", "use": "sig"},
-                    {**json.loads(ECAlgorithm.to_jwk(self.ec.public_key())), "kid": "e", "use": "sig"},
-                ]
-            },
-        }
-
-    def token(self, *, kid: str = "r", key: Any = None, alg: str = "", **claims: Any) -> str:
-        now = time.time()
-        content = {"iss": self.url, "aud": "gridsec", "sub": "ada", "iat": now, "exp": now + 60.0}
-        content |= {"gridsec_role": "operator", **claims}
-        key = key or (self.rsa if kid == "r" else self.ec)
-        left = {name: value for name, value in content.items() if value is not None}
-        return jwt.encode(left, key, alg or ("RS256" if kid == "r" else "ES256"), headers={"kid": kid})
-
-
-class _Answers(BaseHTTPRequestHandler):
-    def do_GET(self) -> None:
-        assert isinstance(self.server, Issuer)
-        found = self.server.documents.get(self.path)
-        self.send_response(404 if found is None else 200)
-        self.end_headers()
-        self.wfile.write(json.dumps(found).encode())
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Silence."""
 
 
 @pytest.fixture(scope="module")
 def issuer() -> Iterator[Issuer]:
-    server = Issuer()
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    yield server
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    with issuing() as server:
+        yield server
 
 
 def verifier(issuer: Issuer, **more: str) -> TokenVerifier:

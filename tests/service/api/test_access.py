@@ -377,6 +377,7 @@ def test_an_open_service_needs_no_key_and_takes_the_given_name(tmp_path: Path) -
             "feeders": None,
             "open": True,
             "expires": None,
+            "expires_utc": None,
         }
         path = f"/api/v1/alarms/{ALARM}/ack"
         assert "Field required" in is_problem(made.http.post(path, json={}), 422)["detail"]

@@ -40,7 +40,7 @@ def test_a_feeder_with_its_tree_and_an_etag(setup: Setup) -> None:
     assert detail.layout.buses[0] == "busbar"
     assert detail.layout.parent[0] is None
     assert len(detail.layout.customers) == 13
-    assert first.headers["etag"] == f'"{detail.revision}"'
+    assert first.headers["etag"] == f'"{detail.revision}-{detail.max_attacked}"'
     again = setup.get("/feeders/village", headers={"If-None-Match": first.headers["etag"]})
     assert (again.status_code, again.content) == (304, b"")
     other = setup.get("/feeders/town", headers={"If-None-Match": first.headers["etag"]})

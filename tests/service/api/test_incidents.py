@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from typing import Any
 
 import httpx
@@ -13,6 +14,8 @@ from pydantic import TypeAdapter
 from service.alarms.incidents import IncidentEvent
 from service.api import models
 from tests.service.asking import T0, Setup, Stream, is_problem
+from tests.service.conftest import SmallService
+from tests.service.databases import both
 
 LIES = {"H1": 9.0, "H2": -8.0, "H3": 9.0}
 
@@ -181,6 +184,33 @@ def several_alarms_at_once_and_one_back(attacked: Setup) -> None:
     is_problem(post(attacked, "/alarms/ack", alarms=[ids[2], "0" * 26]), 404)
     assert attacked.get(f"/alarms/{ids[2]}").json()["state"] == "raised"
     is_problem(post(attacked, "/alarms/ack", alarms=[]), 422)
+
+
+@both
+def test_a_higher_severity_ends_a_shelf(
+    url: str, village: type, serve: Callable[..., Any], family: str
+) -> None:
+    """The shelf of a meter is for major alarms; the critical one of its manipulation ends it and notifies."""
+    assert url.startswith(family)
+    running = SmallService(url, village("village"))
+    running.wall = lambda: T0 + 10
+    setup = Setup(running, serve(running))
+    with setup.http:
+        wanted = {"feeder": "village", "meter": "H3", "severity": "major"}
+        shelf = done(post(setup, "/shelves", duration_s=600.0, reason="exchange", **wanted))
+        setup.attack()
+        assert setup.get("/shelves").json()["shelves"] == []
+        (ended,) = setup.get("/shelves", params={"standing": False}).json()["shelves"]
+        assert (ended["id"], ended["escalated"], ended["ended_by"]) == (shelf["id"], True, None)
+        found = incident(setup)
+        assert (found["severity"], found["shelved_until"]) == ("critical", None)
+        assert [notify for *_, notify in changes(setup, found["id"])][-1]
+        assert setup.get("/alarms", params={"shelved": True}).json()["alarms"] == []
+        # A shelf for this severity holds.
+        done(post(setup, "/shelves", duration_s=600.0, reason="known", **wanted | {"severity": "critical"}))
+        setup.attack(T0 + 4)
+        assert incident(setup)["shelved_until"] == T0 + 610.0
+    running.close()
 
 
 def test_a_shelf_of_each_kind(attacked: Setup) -> None:

@@ -99,10 +99,15 @@ def test_the_list_over_http(setup: Setup) -> None:
     assert [one["name"] for one in first["feeders"]] == ["town", "village"]
     worst = first["feeders"][0]
     assert (worst["status"], worst["suspects"], worst["alarms"], worst["raised"]) == ("attacked", 2, 2, 2)
+    assert [one["incidents"] for one in first["feeders"]] == [1, 0]
     (alarm, _) = http.get("/api/v1/alarms").json()["alarms"]
     assert http.post(f"/api/v1/alarms/{alarm['id']}/ack", json={"who": "Ada"}).status_code == 200
     after = http.get("/api/v1/feeders", params={"status": ["attacked", "no-data"]}).json()
-    assert [(one["name"], one["alarms"], one["raised"]) for one in after["feeders"]] == [("town", 2, 1)]
+    keys = ("name", "alarms", "raised", "incidents")
+    assert [tuple(one[key] for key in keys) for one in after["feeders"]] == [("town", 2, 1, 1)]
+    for k in range(4, 20):
+        service.tick(town.report(T0 + k))
+    assert [one["incidents"] for one in http.get("/api/v1/feeders").json()["feeders"]] == [0, 0]
     assert http.get("/api/v1/feeders", params={"text": "VILL"}).json()["feeders"][0]["status"] == "clean"
     for wrong in ({"order": "best"}, {"limit": 0}, {"offset": -1}, {"status": "bad"}, {"worst": 1}):
         assert http.get("/api/v1/feeders", params=wrong).status_code == 422

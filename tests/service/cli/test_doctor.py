@@ -8,6 +8,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 
@@ -15,6 +16,8 @@ import pytest
 
 from feeders.format.tables import to_json
 from feeders.model.site import load
+from service.access import pki, zenoh_rules
+from service.access.pki import Kind
 from service.cli import doctor
 from service.cli.doctor import Finding, Level
 from service.ingest.queues import BusConfig
@@ -24,6 +27,7 @@ from service.store import Store
 from service.store.backup import NEWEST
 from tests.service.commands import command
 from tests.service.databases import Cluster
+from tests.service.issuer import issuing
 from tests.service.running import FEEDER, free_port
 from tests.service.stored import T0, a_report, an_alarm, raised
 
@@ -65,8 +69,9 @@ def result(text: str) -> dict[str, list[tuple[str, str]]]:
     """Level and text of the lines of each part."""
     out: dict[str, list[tuple[str, str]]] = {}
     for line in text.splitlines():
-        level, part, words = line.split(maxsplit=2)
-        out.setdefault(part.rstrip(":"), []).append((level, words))
+        level, _, rest = line.partition(" ")
+        part, _, words = rest.strip().partition(":")
+        out.setdefault(part, []).append((level, words.strip()))
     return out
 
 
@@ -241,3 +246,83 @@ def test_a_server(cluster: Cluster) -> None:
     assert [each.level for each in found] == [Level.OK, Level.NOTE]
     _, (gone,) = doctor._database("postgresql://gridsec@127.0.0.1:1/gridsec")
     assert gone.level is Level.FAIL
+
+
+def secured(folder: Path, lasts_s: dict[str, float]) -> Path:
+    """Certificates of `gridsec pki`, and the configuration of the router."""
+    now = time.time()
+    pki.create_authority(folder, now, lasts_s=1e8)
+    for name, kind in (("router", Kind.ROUTER), ("service", Kind.SERVICE), ("town.m01", Kind.METER)):
+        pki.issue(folder, name, kind, now, lasts_s=lasts_s.get(name, 1e7))
+    ends, feeders = (zenoh_rules.ENDPOINT,), {"town": frozenset({"m01"})}
+    plan = zenoh_rules.Plan(pki.certificates(folder), feeders, (), ends, "gridsec", folder)
+    for name, content in zenoh_rules.files(plan).items():
+        (folder / name).write_text(content)
+    return folder / "router.json5"
+
+
+def levels(found: Iterable[Finding]) -> dict[str, str]:
+    """Level by the name of the file."""
+    return {Path(each.text.partition(": ")[0]).name: str(each.level) for each in found}
+
+
+def test_certificates_of_a_configuration(tmp_path: Path) -> None:
+    now, file = time.time(), secured(tmp_path, {"router": 60 * 86_400.0})
+    assert levels(doctor._certificates(file, now)) == {"authority.crt": "ok", "router.crt": "ok"}
+    assert levels(doctor._certificates(file, now + 31 * 86_400.0))["router.crt"] == "note"
+    (tmp_path / "router.key").write_bytes((tmp_path / "service.key").read_bytes())
+    (found,) = [each for each in doctor._certificates(file, now) if each.level is Level.FAIL]
+    assert found.text.endswith("router.key is the key of another certificate")
+    (tmp_path / "router.key").unlink()
+    assert levels(doctor._certificates(file, now))["router.crt"] == "FAIL"
+    pki.issue(tmp_path, "router", Kind.ROUTER, now, lasts_s=1e7, renew=True)
+    other = tmp_path / "other"
+    pki.create_authority(other, now, lasts_s=1e8)
+    (tmp_path / "authority.crt").write_bytes((other / "authority.crt").read_bytes())
+    (found,) = [each for each in doctor._certificates(file, now) if each.level is Level.FAIL]
+    assert found.text.endswith("is not issued by the authority of the configuration")
+    (tmp_path / "authority.crt").write_text("none")
+    assert levels(doctor._certificates(file, now)) == {"authority.crt": "FAIL", "router.crt": "ok"}
+    file.write_text("{")
+    (found,) = doctor._certificates(file, now)
+    assert found.level is Level.FAIL
+
+
+def test_an_expired_certificate_wrong_keys_and_an_issuer(
+    tmp_path: Path, monkeypatch: Patch, capsys: Capture
+) -> None:
+    """Each with its line and the exit code 1; all in order with 0."""
+    file, keys = secured(tmp_path, {"router": 1.0}), tmp_path / "keys.csv"
+    usual = ("--database", f"sqlite:///{tmp_path / 'g.db'}", "--http", f"127.0.0.1:{free_port()}")
+    wrong = ("feeder,meter,scheme,key", "town,m01,hmac,!", "town,m01,other,")
+    keys.write_text("\n".join(wrong))
+    time.sleep(1.1)
+    with issuing() as issuer:
+
+        def ran(*arguments: str) -> tuple[int, dict[str, list[tuple[str, str]]]]:
+            code, out, _ = command("doctor")(
+                monkeypatch,
+                capsys,
+                *usual,
+                "--zenoh-config",
+                str(file),
+                "--meter-keys",
+                str(keys),
+                *arguments,
+            )
+            return code, result(out)
+
+        code, found = ran("--oidc-issuer", f"{issuer.url}/absent")
+        assert code == 1
+        assert [level for level, _ in found["certificate"]] == ["ok", "FAIL"]
+        assert "expired on" in found["certificate"][1][1]
+        assert [level for level, _ in found["meter keys"]] == ["FAIL"] * 3
+        assert [level for level, _ in found["issuer"]] == ["FAIL"]
+        pki.issue(tmp_path, "router", Kind.ROUTER, time.time(), lasts_s=1e7, renew=True)
+        keys.write_text("feeder,meter,scheme,key\ntown,m01,certificate,c1\n")
+        code, found = ran("--oidc-issuer", issuer.url)
+        assert code == 0, found
+        assert found["meter keys"] == [("ok", f"{keys}: 1 meters")]
+        assert found["issuer"] == [("ok", f"{issuer.url}: 2 signing keys")]
+        code, found = ran("--oidc-issuer", issuer.url, "--oidc-jwks", f"{issuer.url}/keys")
+        assert (code, found["issuer"][0][0]) == (0, "ok")

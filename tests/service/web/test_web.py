@@ -536,7 +536,7 @@ def test_the_feeder_chosen_last_is_shown_however_slow_the_first(
 def test_nothing_comes_from_elsewhere() -> None:
     web = Path(__file__).parents[3] / "service" / "web"
     foreign = re.compile(r"https?://|(inner|outer)HTML|insertAdjacentHTML|document\.write|eval\(")
-    for file in web.iterdir():
+    for file in [*filter(Path.is_file, web.iterdir()), web / "swagger" / "open.js"]:
         text = file.read_text(encoding="utf-8").replace("http://www.w3.org/2000/svg", "")
         assert not foreign.search(text), file
 
