@@ -189,6 +189,7 @@ def test_numbers_by_verdict_filter_the_list(
     page = site.open(None, "/#one")
     expect(page.locator("#fleet-rows tr")).to_have_count(3)
     first, second = page.locator("#fleet-rows tr").nth(0), page.locator("#fleet-rows tr").nth(1)
+    expect(first.locator("td").nth(4)).to_have_text("1")  # incident of both alarms
     expect(first.locator("td").nth(5)).to_have_text("2, 2 new")
     expect(second.locator("td").nth(3)).to_have_text("25 %")
     page.locator('.alarm:has-text("H1") button.ack').click()
@@ -215,10 +216,11 @@ def test_the_overview_follows_within_a_second_also_in_a_hidden_tab(
     """The tab is hidden as a browser hides it: `visibilityState`, and no paint."""
     villages = [village(f"v{k:04d}", 2) for k in range(count)]
     site = site_of(*villages)
-    for each in villages:
+    live = villages if count == MANY else villages[:20]
+    for each in live:
         tick(site, each, T0)
     page = site.open(None, "/#v0001")
-    expect(page.locator("#fleet-counts")).to_have_text(f"{count} clean")
+    expect(page.locator('#fleet-counts [data-state="clean"]')).to_have_text(f"{len(live)} clean")
     painted_ms = page.evaluate("performance.getEntriesByName('first-contentful-paint')[0].startTime")
     assert painted_ms < 1e3 * PAINT_S
     waited = []
@@ -234,7 +236,7 @@ def test_the_overview_follows_within_a_second_also_in_a_hidden_tab(
         "Object.defineProperty(document, 'visibilityState', { get: () => 'hidden', configurable: true })"
     )
     lists: list[str] = []
-    page.wait_for_timeout(1500)  # requests of the visible page end
+    page.wait_for_timeout(800)  # requests of the visible page end
     page.on("request", lambda request: lists.append(request.url) if "order=worst" in request.url else None)
     for each in villages[:4]:
         tick(site, each, T0 + 2.0, lies={"H1": 9.0})
