@@ -56,6 +56,7 @@ export class Alarms {
     this.onPick = onPick;
     this.onLink = onLink;
     this.onChange = onChange; // Called after each change of an alarm.
+    this.onList = () => {}; // Called after a list with names of customers.
     this.onLog = () => {}; // Called after a log was opened, loaded or closed.
     this.feeder = null;
     this.source = null;
@@ -153,6 +154,7 @@ export class Alarms {
     for (const { seq, alarm } of this.heard.values()) if (seq > page.last_event) this.put(alarm);
     this.next = page.next;
     this.render();
+    this.onList();
   }
 
   // Values that are not part of any event.

@@ -81,7 +81,7 @@ export class Incidents {
     byId("shift-close").addEventListener("click", () => byId("shift").close());
     byId("shift-since").addEventListener("change", () => this.shift());
     byId("work-open").addEventListener("click", () => this.ask("work"));
-    alarms.onLog = () => this.render();
+    alarms.onLog = alarms.onList = () => this.render();
     setInterval(() => this.reload(), EVERY_MS);
   }
 
