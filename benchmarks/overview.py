@@ -9,7 +9,8 @@ over a real connection, gzip included:
 
 - all: `GET /feeders`, time and size of the JSON;
 - page: `GET /feeders?order=worst&limit=50`, the request of the web page;
-- ratio: of both times.
+- numbers: `GET /feeders?limit=0`, the request by which the page follows verdicts;
+- ratio: of the first two times.
 
 With `--page` a browser (Chromium) shows them. Printed besides: time from the navigation to the first
 contentful paint and to the first row of the list (medians of 3), time from a stored verdict to its number
@@ -57,6 +58,7 @@ TICKS = 12  # Ticks of a monitor before the measurement.
 REQUESTS = 15
 VIEWS, CHANGES = 3, 5  # Measurements in the browser.
 HEAD = {"order": "worst", "limit": "50"}  # Request of the web page.
+NUMBERS = {"limit": "0"}  # Request of its numbers by verdict.
 
 
 def ticks_of(site: Site, attack: AttackSpec | None) -> list[Tick]:
@@ -254,7 +256,7 @@ def in_browser(url: str, fleet: Fleet) -> str:
 def main() -> None:
     """Print the times."""
     given = arguments(__doc__, feeders=("100", "1000", "5000"), page=False)
-    print(f"{'feeders':>8}{'all, ms':>9}{'kB':>7}{'page, ms':>10}{'kB':>6}{'ratio':>7}")
+    print(f"{'feeders':>8}{'all, ms':>9}{'kB':>7}{'page, ms':>10}{'kB':>6}{'numbers, ms':>13}{'ratio':>7}")
     for count in map(int, given.feeders):
         with tempfile.TemporaryDirectory() as folder, Store(f"sqlite:///{Path(folder)}/gridsec.db") as store:
             fleet = Fleet(store, count)
@@ -262,7 +264,8 @@ def main() -> None:
                 with httpx.Client(base_url=url, timeout=60) as client:
                     whole, size = request(client, fleet, {})
                     part, small = request(client, fleet, HEAD)
-                row = f"{count:8}{whole:9.1f}{size / 1e3:7.0f}{part:10.1f}{small / 1e3:6.0f}"
+                    numbers, _ = request(client, fleet, NUMBERS)
+                row = f"{count:8}{whole:9.1f}{size / 1e3:7.0f}{part:10.1f}{small / 1e3:6.0f}{numbers:13.1f}"
                 print(f"{row}{whole / part:7.1f}", flush=True)
                 if given.page:
                     print(f"         {in_browser(url, fleet)}", flush=True)

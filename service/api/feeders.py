@@ -77,7 +77,7 @@ def list_feeders(
         str | None, Query(pattern=NAME, description="Feeder that follows the page if it is not on it.")
     ] = None,
     offset: Annotated[int, Query(ge=0, le=MAX_EVENT, description="Number of feeders before the page.")] = 0,
-    limit: Annotated[int | None, Query(ge=1, le=5000, description="Without it all.")] = None,
+    limit: Annotated[int | None, Query(ge=0, le=5000, description="Without it all; 0: numbers only.")] = None,
 ) -> models.Feeders:
     """All feeders with the latest verdict of each, or a page of them, the worst first."""
     alarms, incidents = backend.store.alarms_by_feeder(), backend.store.incidents_by_feeder()

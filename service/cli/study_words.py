@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -18,6 +19,10 @@ if TYPE_CHECKING:
 
     from feeders.model.site import Site
 
+_FRAME: Final = 3
+"""Characters of a column beside its text."""
+_WORDS: Final = 12
+"""Least width of a column with longer words, characters."""
 FORMS: Final = (".svg", ".png", ".pdf")
 
 
@@ -59,13 +64,11 @@ class Output:
     def table(self, title: str, frame: pd.DataFrame) -> None:
         """Print a table without its empty columns, and the meanings of its columns."""
         kept = [name for name in frame.columns if not all(isinstance(c, str) and not c for c in frame[name])]
-        table = Table(*(escape(name.replace("_", " ")) for name in kept), title=title, title_justify="left")
-        unknown = False
-        for row in frame[kept].itertuples(index=False):
-            texts = [cell_text(cell) for cell in row]
-            unknown |= "-" in texts
-            table.add_row(*map(escape, texts))
-        console.out.print(table, soft_wrap=False)
+        texts = {name: [cell_text(cell) for cell in frame[name]] for name in kept}
+        words = {name for name in kept if any(isinstance(cell, str) for cell in frame[name])}
+        for part in tables(title, texts, words, console.out.width):
+            console.out.print(part, soft_wrap=False)
+        unknown = any("-" in cells for cells in texts.values())
         self.explain([*kept, *(["-"] * unknown)])
 
     def explain(self, columns: list[str]) -> None:
@@ -111,6 +114,43 @@ class Output:
 
 def _no_figure(plot: Path) -> None:
     console.say(f"{plot}: not written, this result has no figure")
+
+
+def tables(title: str, texts: Mapping[str, Sequence[str]], words: Collection[str], width: int) -> list[Table]:
+    """Divide a table by columns into tables that fit the width, characters; numbers are never cut.
+
+    texts: cells of each column. words: columns of words, which take several lines where room is short.
+    Each table begins with the columns up to `meter`, otherwise with the first one.
+    """
+    names = [*texts]
+    keys = names[: names.index("meter") + 1] if "meter" in names else names[:1]
+    whole = {name: max(map(len, (name, *texts[name]))) for name in names}
+    fits = sum(whole.values()) + _FRAME * len(names) < width
+    least = {
+        name: max(
+            *map(len, name.split("_")), min(_WORDS if name in words else width, max(map(len, texts[name])))
+        )
+        for name in names
+    }
+    parts, room = [[*keys]], width - 1 - sum(least[name] + _FRAME for name in keys)
+    left = room
+    for name in names[len(keys) :]:
+        left -= 0 if fits else least[name] + _FRAME
+        if left < 0 and len(parts[-1]) > len(keys):
+            parts.append([*keys])
+            left = room - least[name] - _FRAME
+        parts[-1].append(name)
+    out = []
+    for k, part in enumerate(parts, start=1):
+        of = f" ({k} of {len(parts)})" if len(parts) > 1 else ""
+        table = Table(title=f"{title}{of}", title_justify="left")
+        for name in part:
+            header = escape(name.replace("_", " " if fits else "\n"))
+            table.add_column(header, no_wrap=name not in words, overflow="fold")
+        for row in zip(*(texts[name] for name in part), strict=True):
+            table.add_row(*map(escape, row))
+        out.append(table)
+    return out
 
 
 def cell_text(cell: Any) -> str:

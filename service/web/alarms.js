@@ -1,7 +1,8 @@
 // Alarm list: loaded once, then updated by the event stream; actions on a single alarm, and its log.
 
 import { ask, post } from "./actions.js";
-import { byId, clock, deviceName, duration, el, getJson, isKnown, settle, guideLink, signed, sinceNode, volt } from "./dom.js";
+import { byId, clock, duration, el, getJson, isKnown, settle, guideLink, signed, sinceNode, volt } from "./dom.js";
+import { meterName, subjectOf } from "./names.js";
 
 const API = "/api/v1/alarms";
 const KIND = {
@@ -30,14 +31,11 @@ const EVERY_MS = 5000;
 const SOON_MS = 200;
 
 // Meters with stalled learning when the alarm was raised.
-function stalled({ learning = [] }) {
+function stalled({ feeder, evidence: { learning = [] } }) {
   if (!learning.length) return "";
   const more = learning.length > LISTED ? ` and ${learning.length - LISTED} more` : "";
-  return `. Meters: ${learning.slice(0, LISTED).map((m) => m.meter).join(", ")}${more}`;
+  return `. Meters: ${learning.slice(0, LISTED).map((m) => meterName(feeder, m.meter)).join(", ")}${more}`;
 }
-
-// Device of an alarm: a customer's inverter, a meter, or none for an alarm of the whole feeder.
-const subjectOf = ({ customer, meter, evidence }) => customer ?? deviceName(meter, evidence.customer);
 
 // An error of the feeder's files that explains the accusation as well.
 function hint({ data_error: error }) {
@@ -53,25 +51,33 @@ export class Alarms {
     this.heard = new Map(); // Newest event of each alarm during a request: the list may be older.
     this.raised = 0; // Number of active alarms without an acknowledgement, loaded or not.
     this.soon = null;
+    this.wanted = null; // Timer of a search.
     this.turn = 0;
     this.onPick = onPick;
     this.onLink = onLink;
     this.onChange = onChange; // Called after each change of an alarm.
+    this.onList = () => {}; // Called after a list with names of customers.
     this.onLog = () => {}; // Called after a log was opened, loaded or closed.
     this.feeder = null;
     this.source = null;
     this.retry = null;
     this.problem = null; // Problem of the database: active alarms may be missing in the list.
     setInterval(() => this.check(), EVERY_MS);
-    for (const id of ["alarm-state", "alarm-kind"]) byId(id).addEventListener("change", () => this.reload());
+    for (const id of ["alarm-state", "alarm-severity", "alarm-kind"]) byId(id).addEventListener("change", () => this.reload());
     byId("alarm-scope").addEventListener("change", () => this.reload());
+    byId("alarm-text").addEventListener("input", () => this.search());
     byId("alarm-more").addEventListener("click", () => this.reload({ more: true }));
   }
 
   filters() {
     const state = { active: ["raised", "acknowledged"], raised: ["raised"], all: [] }[byId("alarm-state").value];
     const feeder = byId("alarm-scope").value === "this" ? this.feeder : null;
-    return { state, kind: byId("alarm-kind").value, feeder };
+    return { state, severity: byId("alarm-severity").value, kind: byId("alarm-kind").value, feeder, text: byId("alarm-text").value.trim() };
+  }
+
+  // The service searches: several letters, or several events, cause one request.
+  search() {
+    this.wanted ??= setTimeout(() => { this.wanted = null; this.reload(); }, SOON_MS);
   }
 
   watch(feeder) {
@@ -121,11 +127,10 @@ export class Alarms {
   }
 
   async load({ more = false } = {}) {
-    const { state, kind, feeder } = this.filters();
+    const { state, ...others } = this.filters();
     const query = new URLSearchParams({ limit: PAGE });
     for (const value of state) query.append("state", value);
-    if (kind) query.set("kind", kind);
-    if (feeder) query.set("feeder", feeder);
+    for (const [name, value] of Object.entries(others)) if (value) query.set(name, value);
     if (more && this.next) query.set("cursor", this.next);
     this.turn += 1;
     const { turn } = this;
@@ -149,6 +154,7 @@ export class Alarms {
     for (const { seq, alarm } of this.heard.values()) if (seq > page.last_event) this.put(alarm);
     this.next = page.next;
     this.render();
+    this.onList();
   }
 
   // Values that are not part of any event.
@@ -182,13 +188,14 @@ export class Alarms {
 
   // Alarms outside of the filters are not kept: the service has them.
   put(alarm) {
-    if (this.fits(alarm)) this.alarms.set(alarm.id, alarm);
-    else this.alarms.delete(alarm.id);
+    if (!this.fits(alarm)) this.alarms.delete(alarm.id);
+    else if (this.filters().text && !this.alarms.has(alarm.id)) this.search();
+    else this.alarms.set(alarm.id, alarm);
   }
 
   fits(alarm) {
-    const { state, kind, feeder } = this.filters();
-    return (!state.length || state.includes(alarm.state)) && (!kind || alarm.kind === kind) && (!feeder || alarm.feeder === feeder);
+    const { state, severity, kind, feeder } = this.filters();
+    return (!state.length || state.includes(alarm.state)) && (!severity || alarm.severity === severity) && (!kind || alarm.kind === kind) && (!feeder || alarm.feeder === feeder);
   }
 
   shown() {
@@ -220,7 +227,7 @@ export class Alarms {
     const e = alarm.evidence;
     const numbers = isKnown(e.v_volt_reported) && alarm.kind === "meter-manipulated"
       ? `${volt(e.v_volt_reported)} reported, ${volt(e.v_volt_estimated)} reconstructed (${signed(e.v_volt_reported - e.v_volt_estimated)} V${e.kind ? `, ${e.kind}` : ""})`
-      : `${alarm.reason}${stalled(e)}`;
+      : `${alarm.reason}${stalled(alarm)}`;
     const subject = subjectOf(alarm);
     const where = subject ? `${subject} · ${alarm.feeder}` : alarm.feeder;
     const since = alarm.state === "cleared"

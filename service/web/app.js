@@ -5,10 +5,11 @@ import { Incidents } from "./incidents.js";
 import { Commissioning } from "./commissioning.js";
 import { showDetail } from "./detail.js";
 import { Diagram } from "./diagram.js";
-import { APART, ages, bare, busbarWords, byId, clock, deviceName, duration, el, getJson, isKnown, signed, status } from "./dom.js";
+import { APART, ages, bare, busbarWords, byId, clock, duration, el, getJson, isKnown, signed, status } from "./dom.js";
 import { Fleet } from "./fleet.js";
 import { session } from "./session.js";
 import { Banner, offline } from "./banner.js";
+import { meterName, rememberLayout } from "./names.js";
 import { Series } from "./series.js";
 
 const API = "/api/v1/feeders";
@@ -25,7 +26,7 @@ const pick = async (feeder, meter, owner) => {
 const alarms = new Alarms({
   onPick: pick,
   onLink: (up) => { page.alarmsLinked = up; },
-  onChange: () => incidents.later(),
+  onChange: () => { incidents.later(); fleet.hint(); },
 });
 const incidents = new Incidents({ alarms, onPick: pick });
 
@@ -97,6 +98,7 @@ async function show(name, query = new URLSearchParams()) {
   }
   const again = page.feeder?.name === name; // Connected again, or other tables: the series stays.
   page.feeder = found;
+  rememberLayout(found);
   page.refused = null;
   page.report = null;
   page.heard = null;
@@ -160,6 +162,7 @@ function take(report) {
     if (past.length > KEPT) past.shift();
     page.past.set(meter.meter, past);
   }
+  fleet.hint();
   diagram.update(report);
   series.take(report);
   verdict();
@@ -310,8 +313,8 @@ function table() {
     const now = status(m, limits, page.report);
     return el("tr", { "data-status": now.key },
       el("th", { scope: "row" }, customer.has(m.meter)
-        ? el("button", { type: "button", class: "plain", text: deviceName(m.meter, customer.get(m.meter)), on: { click: () => select(customer.get(m.meter)) } })
-        : el("span", { text: m.meter })),
+        ? el("button", { type: "button", class: "plain", text: meterName(page.feeder.name, m.meter), on: { click: () => select(customer.get(m.meter)) } })
+        : el("span", { text: meterName(page.feeder.name, m.meter) })),
       el("td", { class: "num", text: bare(m.v_volt_reported) }),
       el("td", { class: "num", text: m.model_only && isKnown(m.v_volt_estimated) ? `model ${bare(m.v_volt_estimated)}` : bare(m.v_volt_estimated) }),
       el("td", { class: "num", text: signed(!m.model_only && isKnown(m.v_volt_reported) && isKnown(m.v_volt_estimated) ? m.v_volt_reported - m.v_volt_estimated : null) }),

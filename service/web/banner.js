@@ -1,7 +1,8 @@
 // Status banner: displayed verdict, its start, its certainty, the next step, and all suspects.
 // The displayed verdict changes only after the delays of the alarms; the verdict of the latest tick stands beside it.
 
-import { APART, GUIDE, byId, clock, deviceName, duration, el, isKnown, signed } from "./dom.js";
+import { APART, GUIDE, byId, clock, duration, el, isKnown, signed } from "./dom.js";
+import { BUSBAR, customerName, meterName } from "./names.js";
 
 const SHOWN = 8; // Suspects before the button for all.
 const SIGNS = {
@@ -50,13 +51,15 @@ export function displayed(report) {
   };
 }
 
-function explanationWords({ meters, inverters, powers = [], probability }) {
-  const parts = [...meters, ...inverters.map((c) => `inverter of ${c}`), ...powers.map((c) => `reported power of ${c}`)];
+function explanationWords(feeder, { meters, inverters, powers = [], probability }) {
+  const of = (kind) => (customer) => `${kind} of ${customerName(feeder, customer)}`;
+  const parts = [...meters.map((meter) => meterName(feeder, meter)), ...inverters.map(of("inverter")), ...powers.map(of("reported power"))];
   return `${parts.join(" and ")} (${percent(probability)})`;
 }
 
 // Certainty of the displayed verdict, from the numbers of the latest tick.
 function certainty(report, shown, name) {
+  const explained = (e) => explanationWords(report.feeder, e);
   const judged = report.meters.filter((m) => m.seen && isKnown(m.score) && isKnown(m.threshold) && m.threshold > 0);
   const ratio = (m) => m.score / m.threshold;
   const times = (value) => (value >= 10 ? String(Math.round(value)) : value.toFixed(1));
@@ -65,7 +68,7 @@ function certainty(report, shown, name) {
     const named = judged.filter((m) => shown.suspects.includes(m.meter));
     if (!named.length || report.verdict !== "attacked") return `${tested} at this tick.`;
     const strongest = named.reduce((a, b) => (ratio(b) > ratio(a) ? b : a));
-    const rivals = report.explanations?.length ? ` Explanations: ${report.explanations.slice(0, 3).map(explanationWords).join(", ")}.` : "";
+    const rivals = report.explanations?.length ? ` Explanations: ${report.explanations.slice(0, 3).map(explained).join(", ")}.` : "";
     const much = ratio(strongest) > 1
       ? `Strongest evidence at this tick: ${name(strongest.meter)}, ${times(ratio(strongest))} times the largest score of an honest meter.`
       : `Named by earlier readings; at this tick the largest score is ${percent(ratio(strongest))} of its threshold (${name(strongest.meter)}).`;
@@ -77,14 +80,14 @@ function certainty(report, shown, name) {
     return `${tested}; largest score ${percent(ratio(largest))} of its threshold (${name(largest.meter)}).`;
   }
   if (APART[shown.cause]) return "Not evaluated: neither an attack nor its absence is established.";
-  if (report.explanations?.length) return `Possible: ${report.explanations.slice(0, 3).map(explanationWords).join(", or ")}.`;
+  if (report.explanations?.length) return `Possible: ${report.explanations.slice(0, 3).map(explained).join(", or ")}.`;
   return `No answer: neither an attack nor its absence is established. ${tested}.`;
 }
 
 // Number of silent meters, with the longest silence.
 function silence({ silent, meters }) {
   const longest = Math.max(...silent.map((s) => s.seconds ?? 0));
-  const own = silent.filter((s) => s.meter !== "substation").length;
+  const own = silent.filter((s) => s.meter !== BUSBAR).length;
   const busbar = own < silent.length ? " and the busbar meter" : "";
   return `${own} of ${meters.length} meters${busbar} silent, up to ${duration(longest)}`;
 }
@@ -111,7 +114,7 @@ export class Banner {
   }
 
   name(meter) {
-    return deviceName(meter, this.feeder.layout.customers.find((c) => c.meter === meter)?.customer);
+    return meterName(this.feeder.name, meter);
   }
 
   decision(kind, word) {
@@ -188,11 +191,12 @@ export class Banner {
     const kvar = (c) => (isKnown(named.get(c)?.attack_kvar_estimated) ? ` ${signed(named.get(c).attack_kvar_estimated)} kvar` : "");
     const accused = new Set([...shown.suspects, ...shown.inverters]);
     const candidates = shown.verdict === "undecided" ? (report.explanations ?? []).flatMap((e) => [...e.meters, ...e.inverters]) : [];
+    const meters = new Set([...customer.keys(), BUSBAR]);
     const every = [
       ...shown.suspects.map((m) => chip("suspect", `${this.name(m)}${off(m)}`, () => go(m))),
-      ...shown.inverters.map((c) => chip("suspect", `inverter of ${c}${kvar(c)}`, () => this.onSelect(c))),
+      ...shown.inverters.map((c) => chip("suspect", `inverter of ${customerName(this.feeder.name, c)}${kvar(c)}`, () => this.onSelect(c))),
       ...[...new Set(candidates)].filter((one) => !accused.has(one)).map((one) =>
-        chip("doubtful", `candidate ${this.name(one)}`, () => (customer.has(one) || one === "substation" ? go(one) : this.onSelect(one)))),
+        chip("doubtful", `candidate ${meters.has(one) ? this.name(one) : `inverter of ${customerName(this.feeder.name, one)}`}`, () => (customer.has(one) || one === BUSBAR ? go(one) : this.onSelect(one)))),
       ...(report.silent.length > SILENT && !this.all
         ? [chip("silent", silence(report), () => this.unfold(report, shown))]
         : report.silent.map((s) => chip("silent", `${this.name(s.meter)} silent ${isKnown(s.seconds) ? duration(s.seconds) : ""}`, () => go(s.meter)))),

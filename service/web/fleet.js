@@ -5,8 +5,9 @@ import { APART, byId, duration, el, getJson, isKnown, settle } from "./dom.js";
 import { session } from "./session.js";
 
 const API = "/api/v1/feeders";
-const EVERY_MS = 2000;
-const SHARE = 10; // A request takes at most this part of the time between two of them.
+const EVERY_MS = 500; // Between two requests of the numbers by verdict.
+const LIST_MS = 2000; // Between two requests of the list while these numbers stay.
+const SHARE = 5; // A request takes at most this part of the time between two of them.
 const HEAD = 50; // Feeders in the selector.
 const PAGE = 80; // Rows that are loaded around the visible ones.
 const AROUND = 8; // Rows that are drawn above and below the visible ones.
@@ -43,7 +44,11 @@ export class Fleet {
     this.word = null;
     this.nodes = new Map();
     this.turn = 0;
+    this.timer = null;
+    this.due = Infinity; // Time of the next request, ms.
+    this.listed = 0; // Time of the latest request of the list, ms.
     this.goal = null; // Row that gets the focus as soon as it is drawn.
+    document.addEventListener("visibilitychange", () => { if (document.visibilityState !== "hidden" && this.timer) this.run(); });
     byId("fleet-all").addEventListener("toggle", () => this.refresh());
     byId("fleet-filter").addEventListener("input", () => this.search());
     byId("fleet-scroll").addEventListener("scroll", () => this.scrolled());
@@ -63,7 +68,20 @@ export class Fleet {
   }
 
   wait(time) {
-    setTimeout(async () => this.wait(await this.update()), time);
+    clearTimeout(this.timer);
+    this.due = performance.now() + time;
+    this.timer = setTimeout(() => this.run(), time);
+  }
+
+  async run() {
+    clearTimeout(this.timer);
+    this.due = Infinity;
+    this.wait(await this.update());
+  }
+
+  // An event of a stream: browsers delay the timers of hidden tabs by up to a minute.
+  hint() {
+    if (performance.now() >= this.due) this.run();
   }
 
   query(parameters) {
@@ -76,13 +94,16 @@ export class Fleet {
     return byId("fleet-all").open;
   }
 
-  // Returns the time until the next request, ms.
-  async update() {
-    if (document.visibilityState === "hidden" && this.size > HEAD) return EVERY_MS;
+  /* Returns the time until the next request, ms. The numbers by verdict and the shown feeder come first; the list
+     follows if a number has changed or `LIST_MS` have passed. A hidden tab needs the numbers alone, for its title. */
+  async update({ list = false } = {}) {
     const begun = performance.now();
     try {
-      this.take(await getJson(this.query({ limit: HEAD })));
-      if (this.long) await this.load();
+      const changed = this.count(await getJson(this.query({ limit: 0, order: "given" })));
+      if (list || ((changed || begun - this.listed >= LIST_MS) && document.visibilityState !== "hidden")) {
+        this.take(await getJson(this.query({ limit: HEAD })));
+        if (this.long) await this.load();
+      }
       byId("fleet").dataset.fresh = "yes";
     } catch (error) {
       byId("fleet").dataset.fresh = "no";
@@ -91,8 +112,22 @@ export class Fleet {
     return Math.max(EVERY_MS, SHARE * (performance.now() - begun));
   }
 
+  // Numbers by verdict, and the shown feeder. Returns true if a number differs from the drawn one.
+  count({ feeders, counts, causes = {} }) {
+    const before = JSON.stringify([this.counts, this.causes, this.size]);
+    const size = Object.values(counts).reduce((sum, each) => sum + each, 0);
+    Object.assign(this, { counts, causes, size });
+    for (const feeder of feeders) this.beside.set(feeder.name, feeder);
+    const found = new Map(feeders.map((feeder) => [feeder.name, feeder]));
+    const newer = (feeder) => found.get(feeder.name) ?? feeder;
+    this.head = this.head.map(newer);
+    this.rows = { ...this.rows, feeders: this.rows.feeders.map(newer) };
+    this.render();
+    return before !== JSON.stringify([counts, causes, size]);
+  }
+
   take({ feeders, counts, causes = {}, total }) {
-    Object.assign(this, { counts, causes, size: total });
+    Object.assign(this, { counts, causes, size: total, listed: performance.now() });
     this.head = feeders.slice(0, Math.min(HEAD, total));
     this.keep(feeders);
     this.render();
@@ -156,7 +191,7 @@ export class Fleet {
     this.selected = name;
     const found = this.beside.get(name) ?? this.rows.feeders.find((feeder) => feeder.name === name);
     if (found) this.beside.set(name, found);
-    else this.update();
+    else this.update({ list: true });
     this.render();
   }
 
@@ -192,7 +227,7 @@ export class Fleet {
     }));
     byId("fleet-table").setAttribute("aria-rowcount", String((open ? this.total : this.size) + 1));
     const gap = (rows, key) => {
-      const node = this[key] ??= el("tr", { class: "gap", "aria-hidden": true }, el("td", { colspan: 6 }));
+      const node = this[key] ??= el("tr", { class: "gap", "aria-hidden": true }, el("td", { colspan: 7 }));
       node.firstChild.style.height = `${rows * rowHeight()}px`;
       return rows > 0 ? [node] : [];
     };
@@ -246,11 +281,11 @@ export class Fleet {
 
   cells(feeder) {
     const silent = feeder.meters ? `${Math.round((100 * feeder.silent) / feeder.meters)} %` : "";
-    return [stateOf(feeder), wordOf(feeder), titleOf(feeder), lasting(feeder), String(feeder.suspects || ""), silent, String(feeder.alarms || ""), feeder.raised ? `, ${feeder.raised} new` : ""];
+    return [stateOf(feeder), wordOf(feeder), titleOf(feeder), lasting(feeder), String(feeder.suspects || ""), silent, String(feeder.incidents || ""), String(feeder.alarms || ""), feeder.raised ? `, ${feeder.raised} new` : ""];
   }
 
   row(feeder, k) {
-    const [state, word, title, since, suspects, silent, alarms, fresh] = this.cells(feeder);
+    const [state, word, title, since, suspects, silent, incidents, alarms, fresh] = this.cells(feeder);
     return el("tr", { "data-state": state, "data-feeder": feeder.name, "aria-rowindex": k + 2, "aria-current": feeder.name === this.selected ? "true" : null },
       el("td", {}, el("span", { class: "fleet-state", "data-state": state, text: word })),
       el("th", { scope: "row" }, el("button", { type: "button", class: "plain", text: title, title, on: { click: () => this.onPick(feeder.name) } }),
@@ -258,6 +293,7 @@ export class Fleet {
       el("td", { class: "num", text: since }),
       el("td", { class: "num", text: suspects }),
       el("td", { class: "num", text: silent }),
+      el("td", { class: "num", text: incidents }),
       el("td", { class: "num" }, alarms, el("span", { class: "fresh", text: fresh })));
   }
 

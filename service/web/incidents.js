@@ -2,6 +2,7 @@
 
 import { ask, post } from "./actions.js";
 import { byId, clock, duration, el, getJson, guideLink, isKnown, settle, sinceNode } from "./dom.js";
+import { BUSBAR, customerName, meterName } from "./names.js";
 import { session } from "./session.js";
 
 const API = "/api/v1";
@@ -29,7 +30,6 @@ const ACTIONS = {
   work: { title: "Planned work", verb: "Enter", text: "Reason", needed: true },
 };
 const HOURS = [1, 4, 8, 24, 72, 168];
-const BUSBAR = "substation";
 const PAGE = 50;
 const ALARMS_SHOWN = 100;
 const METERS_LISTED = 20; // Largest number of meters in the choice of a shelf.
@@ -38,18 +38,20 @@ const SOON_MS = 200;
 
 const plural = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
 // Devices of an incident: one by name, several by number.
-function subject({ meters, customers }) {
+function subject({ feeder, meters, customers }) {
   const own = meters.filter((meter) => meter !== BUSBAR);
   const busbar = own.length < meters.length;
-  if (own.length) return `${own.length > 1 ? plural(own.length, "meter") : own[0]}${busbar ? " and the busbar meter" : ""}`;
-  if (busbar) return "busbar meter";
-  if (customers.length) return customers.length === 1 ? customers[0] : plural(customers.length, "inverter");
+  if (own.length) return `${own.length > 1 ? plural(own.length, "meter") : meterName(feeder, own[0])}${busbar ? " and the busbar meter" : ""}`;
+  if (busbar) return meterName(feeder, BUSBAR);
+  if (customers.length) return customers.length === 1 ? `inverter of ${customerName(feeder, customers[0])}` : plural(customers.length, "inverter");
   return null;
 }
 
+const answerable = ({ state, unacknowledged }) => state !== "cleared" && unacknowledged > 0;
+
 // Sentence on an incident: the devices of a manipulation, otherwise the reason of its severest alarm.
-function reasonOf({ kind, meters, customers, reason }) {
-  const named = [...meters, ...customers.map((customer) => `inverter of ${customer}`)];
+function reasonOf({ feeder, kind, meters, customers, reason }) {
+  const named = [...meters.map((meter) => meterName(feeder, meter)), ...customers.map((customer) => `inverter of ${customerName(feeder, customer)}`)];
   if (kind !== "manipulation" || !named.length) return reason;
   const more = named.length > METERS_LISTED ? ` and ${named.length - METERS_LISTED} more` : "";
   return named.length === 1 ? `${named[0]} ${reason}` : `Named as manipulated: ${named.slice(0, METERS_LISTED).join(", ")}${more}.`;
@@ -62,6 +64,7 @@ export class Incidents {
     this.found = [];
     this.items = new Map();
     this.open = new Map(); // Alarms and events of expanded incidents.
+    this.chosen = new Set(); // Selected incidents.
     this.feeder = null;
     this.limit = PAGE;
     this.turn = 0;
@@ -71,11 +74,14 @@ export class Incidents {
     byId("incident-text").addEventListener("input", () => this.later());
     byId("incident-more").addEventListener("click", () => { this.limit += PAGE; this.reload(); });
     byId("incident-list").addEventListener("keydown", (event) => this.key(event));
+    byId("incident-chosen-ack").addEventListener("click", () => this.acknowledge());
+    byId("incident-chosen-all").addEventListener("click", () => this.choose(this.found.filter(answerable)));
+    byId("incident-chosen-none").addEventListener("click", () => this.choose([]));
     byId("shift-open").addEventListener("click", () => this.shift());
     byId("shift-close").addEventListener("click", () => byId("shift").close());
     byId("shift-since").addEventListener("change", () => this.shift());
     byId("work-open").addEventListener("click", () => this.ask("work"));
-    alarms.onLog = () => this.render();
+    alarms.onLog = alarms.onList = () => this.render();
     setInterval(() => this.reload(), EVERY_MS);
   }
 
@@ -138,6 +144,37 @@ export class Incidents {
     if (this.open.has(id)) this.open.set(id, { alarms, more: next !== null, events });
   }
 
+  // Select incidents: ids of others are dropped.
+  choose(incidents) {
+    this.chosen = new Set(incidents.map(({ id }) => id));
+    this.render();
+  }
+
+  mark(id) {
+    if (!this.chosen.delete(id)) this.chosen.add(id);
+    this.render();
+  }
+
+  // Acknowledge all selected incidents; those that the service refuses stay selected.
+  acknowledge() {
+    const chosen = this.found.filter(({ id }) => this.chosen.has(id));
+    ask({
+      ...ACTIONS.ack,
+      title: `Acknowledge ${plural(chosen.length, "incident")}`,
+      what: `${chosen.map((one) => `${KIND[one.kind] ?? one.kind}: ${one.feeder}`).join(", ")}.`,
+      send: async (by, values) => {
+        const refused = [];
+        for (const one of chosen.filter(({ id }) => this.chosen.has(id))) {
+          const [url, body] = request("ack", one, values);
+          await post(url, { ...by, ...body }).then(() => this.chosen.delete(one.id), (error) => refused.push(`${one.feeder}: ${error.message}`));
+        }
+        await this.reload();
+        if (refused.length) throw new Error(refused.join("; "));
+        byId("incident-list").querySelector(".line")?.focus();
+      },
+    });
+  }
+
   async toggle(id) {
     if (this.open.has(id)) {
       this.open.delete(id);
@@ -150,6 +187,10 @@ export class Incidents {
   }
 
   render() {
+    for (const id of this.chosen) if (!this.found.some((one) => one.id === id && answerable(one))) this.chosen.delete(id);
+    byId("incident-chosen").hidden = this.chosen.size === 0;
+    const text = `${this.chosen.size} selected`;
+    if (byId("incident-chosen-count").textContent !== text) byId("incident-chosen-count").textContent = text;
     byId("incident-none").hidden = this.found.length > 0 || !byId("incident-error").hidden || !byId("incident-loading").hidden;
     byId("incident-none").textContent = byId("incident-state").value === "all" ? "No incidents." : "No open incidents. Choose “All, with cleared” for earlier ones.";
     const focused = document.activeElement?.closest?.("[data-incident]");
@@ -158,7 +199,7 @@ export class Incidents {
     const before = this.items;
     this.items = new Map(this.found.map((incident) => {
       const open = this.open.get(incident.id);
-      const said = JSON.stringify([incident, open, (open?.alarms ?? []).map((alarm) => this.alarms.content(alarm))]);
+      const said = JSON.stringify([incident, this.chosen.has(incident.id), subject(incident), reasonOf(incident), open, (open?.alarms ?? []).map((alarm) => this.alarms.content(alarm))]);
       const old = before.get(incident.id);
       return [incident.id, old?.said === said ? old : { said, node: this.item(incident) }];
     }));
@@ -177,7 +218,7 @@ export class Incidents {
       ? `cleared after ${duration(incident.t_cleared - incident.t_first)}`
       : `${plural(incident.active, "alarm")}${incident.unacknowledged ? `, ${incident.unacknowledged} new` : ""}`;
     const note = (text, kind) => (text ? el("span", { class: "note", "data-kind": kind, text }) : null);
-    const line = el("button", { type: "button", class: "line", "aria-expanded": String(shown), "aria-keyshortcuts": "a u c g s", "data-act": "line", on: { click: () => this.toggle(incident.id) } },
+    const line = el("button", { type: "button", class: "line", "aria-expanded": String(shown), "aria-keyshortcuts": "a u c g s x", "data-act": "line", on: { click: () => this.toggle(incident.id) } },
       el("span", { class: "grade", text: incident.severity }),
       el("b", { text: KIND[incident.kind] ?? incident.kind }),
       el("span", { class: "place", text: place }),
@@ -189,6 +230,7 @@ export class Incidents {
       note(incident.assigned_to ? `→ ${incident.assigned_to}` : "", "assigned"));
     const suppressed = isKnown(incident.shelved_until) || isKnown(incident.planned_until);
     return el("li", { class: "incident", "data-incident": incident.id, "data-severity": incident.severity, "data-state": incident.state, "data-suppressed": suppressed ? "yes" : "no" },
+      answerable(incident) ? el("input", { type: "checkbox", class: "pick", "data-act": "pick", checked: this.chosen.has(incident.id), "aria-label": `Select ${KIND[incident.kind] ?? incident.kind}, ${place}`, on: { change: () => this.mark(incident.id) } }) : null,
       line, shown ? this.body(incident) : null);
   }
 
@@ -236,6 +278,11 @@ export class Incidents {
       return;
     }
     const incident = this.found.find((one) => one.id === own?.dataset.incident);
+    if (event.key.toLowerCase() === "x" && incident && answerable(incident)) {
+      event.preventDefault();
+      this.mark(incident.id);
+      return;
+    }
     const name = Object.keys(ACTIONS).find((each) => ACTIONS[each].key === event.key.toLowerCase());
     if (!incident || !name || (incident.state === "cleared" && !["comment", "assign"].includes(name))) return;
     if (name === "ack" && !incident.unacknowledged) return;
@@ -332,14 +379,14 @@ export class Incidents {
 
 // Alarms of a shelf.
 function shelved(one) {
-  const what = one.alarm ? "one alarm" : one.incident ? "one incident" : [one.meter, one.kind].filter(Boolean).join(", ");
+  const what = one.alarm ? "one alarm" : one.incident ? "one incident" : [one.meter && meterName(one.feeder, one.meter), one.kind].filter(Boolean).join(", ");
   return `${one.feeder}: ${what}`;
 }
 
 // Alarms that a shelf may cover: those of the incident, of one of its meters, of one of its kinds.
 function scopes({ id, feeder, meters, kinds }) {
   const own = [["this incident", { incident: id }]];
-  for (const meter of meters.slice(0, METERS_LISTED)) own.push([`all of ${meter}`, { feeder, meter }]);
+  for (const meter of meters.slice(0, METERS_LISTED)) own.push([`all of ${meterName(feeder, meter)}`, { feeder, meter }]);
   for (const kind of kinds) own.push([`all ${kind} of ${feeder}`, { feeder, kind }]);
   return own.map(([text, value]) => [JSON.stringify(value), text]);
 }

@@ -1,10 +1,10 @@
 // Time series of meters: reported and reconstructed voltage with its uncertainty band, verdicts and alarms.
 // One panel per meter over a common time axis; minimum and maximum of each pixel column.
 
-import { bare, byId, clock, deviceName, duration, el, getJson, isKnown, nominals, svg, volt } from "./dom.js";
+import { bare, byId, clock, duration, el, getJson, isKnown, nominals, svg, volt } from "./dom.js";
+import { BUSBAR, meterName, subjectOf } from "./names.js";
 
 const API = "/api/v1/feeders";
-const BUSBAR = "substation";
 const MOST = 6; // Meters in one chart.
 const SPANS = [[3600, "1 h"], [21600, "6 h"], [86400, "24 h"], [604800, "7 d"], [1209600, "14 d"]];
 const [SHORTEST_S, LONGEST_S] = [60, 1209600];
@@ -92,7 +92,9 @@ export function times(since, until, most) {
   for (const day = first; day / 1000 < until; day.setDate(day.getDate() + 1)) {
     const next = new Date(day);
     next.setDate(next.getDate() + 1);
-    for (let t = day / 1000; t < Math.min(until, next / 1000); t += step) if (t >= since) found.push(t);
+    // Steps of hours are hours of the clock: it repeats one, or leaves one out, at a change.
+    const hour = step > 3600 ? (k) => new Date(day).setHours((k * step) / 3600) / 1000 : (k) => day / 1000 + k * step;
+    for (let k = 0, t = hour(0); t < Math.min(until, next / 1000); k += 1, t = hour(k)) if (t >= since) found.push(t);
   }
   return { found, step };
 }
@@ -145,7 +147,11 @@ export class Series {
     on("series-now", () => this.now());
     on("series-close", () => this.close());
     byId("series-add").addEventListener("change", (event) => this.add(event.target.value));
-    byId("series-box").addEventListener("toggle", () => this.table());
+    // Folded, the table is invisible, and screen readers have it all the same.
+    on("series-table", () => {
+      const unseen = byId("series-box").classList.toggle("unseen");
+      byId("series-table").setAttribute("aria-expanded", String(!unseen));
+    });
     this.chart = byId("series-chart");
     this.chart.addEventListener("keydown", (event) => this.key(event));
     this.chart.addEventListener("pointerdown", (event) => this.press(event));
@@ -220,8 +226,12 @@ export class Series {
 
   // Id of a meter, then its customer.
   name(meter) {
-    const customer = this.feeder.layout.customers.find((c) => c.meter === meter)?.customer;
-    return meter === BUSBAR ? "substation · busbar meter" : deviceName(meter, customer);
+    return meterName(this.feeder.name, meter);
+  }
+
+  // Device of an alarm, empty for the whole feeder.
+  subject(alarm) {
+    return subjectOf({ feeder: this.feeder.name, ...alarm });
   }
 
   add(meter) {
@@ -433,7 +443,8 @@ export class Series {
       if (row >= ALARM_ROWS) { more.count += 1; continue; }
       ends[row] = drawn + 2;
       const y = begin + row * ROW;
-      const what = `${alarm.kind}${alarm.customer ?? alarm.meter ? `, ${alarm.customer ?? alarm.meter}` : ""}: ${moment(alarm.t_raised)}, ${alarm.t_cleared === null ? "active" : `cleared ${moment(alarm.t_cleared)}`}`;
+      const about = this.subject(alarm);
+      const what = `${alarm.kind}${about ? `, ${about}` : ""}: ${moment(alarm.t_raised)}, ${alarm.t_cleared === null ? "active" : `cleared ${moment(alarm.t_cleared)}`}`;
       nodes.push(svg("g", { class: `alarm-span ${alarm.severity}${this.chosen.includes(alarm.meter) ? " own" : ""}` },
         svg("title", { text: what }),
         svg("rect", { x: a.toFixed(1), y, width: (drawn - a).toFixed(1), height: ROW - 3, rx: 2 }),
@@ -588,7 +599,7 @@ export class Series {
     for (const [name, value] of Object.entries({ x1: at, x2: at, visibility: "visible" })) this.cursor.setAttribute(name, value);
     const rows = data.meters.map((meter) => {
       const [[r0, r1], [e0, e1], [b0, b1]] = ["reported", "estimated", "band"].map((name) => extremes(meter, name, k, k + 1));
-      return el("span", {}, el("b", { text: meter.meter }), ` reported ${between(r0, r1)} V, reconstructed ${between(e0, e1)} V${isKnown(b0) ? ` (band ${between(b0, b1)} V)` : ""}`);
+      return el("span", {}, el("b", { text: this.name(meter.meter) }), ` reported ${between(r0, r1)} V, reconstructed ${between(e0, e1)} V${isKnown(b0) ? ` (band ${between(b0, b1)} V)` : ""}`);
     });
     tip.replaceChildren(el("b", { text: `${moment(data.t[k])} · ${verdictOf(data, k, k + 1)}` }), ...rows);
     tip.hidden = false;
@@ -612,7 +623,7 @@ export class Series {
 
   table() {
     const { data } = this;
-    if (!data || !byId("series-box").open) return;
+    if (!data) return;
     const each = Math.max(1, Math.ceil(data.t.length / TABLE_ROWS));
     const rows = [];
     for (let from = 0; from < data.t.length; from += each) {
@@ -629,7 +640,7 @@ export class Series {
     }
     byId("series-rows").replaceChildren(...rows);
     byId("series-alarms").replaceChildren(...data.alarms.map((alarm) => el("li", {
-      text: `${alarm.kind}, ${alarm.customer ?? alarm.meter ?? "whole feeder"}, ${alarm.severity}: raised ${clock(alarm.t_raised, { day: true })}, ${alarm.t_cleared === null ? "active" : `cleared ${clock(alarm.t_cleared, { day: true })}`}`,
+      text: `${alarm.kind}, ${this.subject(alarm) || "whole feeder"}, ${alarm.severity}: raised ${clock(alarm.t_raised, { day: true })}, ${alarm.t_cleared === null ? "active" : `cleared ${clock(alarm.t_cleared, { day: true })}`}`,
     })));
     byId("series-no-alarms").hidden = data.alarms.length > 0;
   }

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
-from feeders.format.tables import CustomerRow, FeederMeta, FeederTables, LineRow
-from feeders.model.site import Site, from_tables
+from feeders.format.tables import CustomerRow, FeederMeta, FeederTables, LineRow, write
+from feeders.model.site import Site, from_tables, load
 
 
 def tables() -> FeederTables:
@@ -53,3 +55,17 @@ def village_without_inverters() -> Site:
     plain = tables()
     rows = tuple(replace(row, inverter_kva=0.0, droop="") for row in plain.customers)
     return from_tables(replace(plain, customers=rows))
+
+
+def with_long_ids(like: str, folder: Path) -> Path:
+    """Write a feeder with the longest ids of customers and meters, 64 characters, and return its folder."""
+
+    def long(text: str) -> str:
+        return text and f"{re.sub('[^A-Za-z0-9]', '-', text)}-{'x' * 64}"[:64]
+
+    found = load(like).tables
+    customers = tuple(
+        replace(row, customer=long(row.customer), meter=long(row.meter)) for row in found.customers
+    )
+    write(replace(found, meta=replace(found.meta, name="long-" + "i" * 59), customers=customers), folder)
+    return folder

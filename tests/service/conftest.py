@@ -73,10 +73,14 @@ class Village:
             self.customers.append({"customer": f"{prefix}{k}", "bus": f"drop-{k}", "meter": f"{prefix}{k}"})
         self.meters = [c["meter"] for c in self.customers]
 
+    @property
+    def title(self) -> str:
+        return f"{self.name.capitalize()}, {len(self.customers)} customers"
+
     def detail(self) -> dict[str, Any]:
         fields = {
             "name": self.name,
-            "title": f"{self.name.capitalize()}, {len(self.customers)} customers",
+            "title": self.title,
             "v_nominal_volt": NOMINAL,
             "v_min_volt": 0.9 * NOMINAL,
             "v_max_volt": 1.1 * NOMINAL,
@@ -234,7 +238,7 @@ class SmallService:
             self.loop.call_soon_threadsafe(put)
 
     def feeders(self) -> list[dict[str, Any]]:
-        watched = [{"name": v.name, "title": v.detail()["title"]} for v in self.villages.values()]
+        watched = [{"name": v.name, "title": v.title} for v in self.villages.values()]
         return watched + [{"name": name, "problem": why} for name, why in self.cannot_load.items()]
 
     def feeder(self, name: str) -> dict[str, Any] | None:

@@ -5,9 +5,44 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import pytest
 from playwright.sync_api import Browser, Page
 
-DESKTOP, PHONE = {"width": 1440, "height": 1000}, {"width": 390, "height": 844}
+DESKTOP, PHONE = {"width": 1400, "height": 900}, {"width": 390, "height": 844}
+
+LOOKS = pytest.mark.parametrize(
+    ("size", "scheme"),
+    [(DESKTOP, "light"), (PHONE, "light"), (DESKTOP, "dark")],
+    ids=["desktop", "phone", "desktop-dark"],
+)
+"""Sizes of a window, and the dark scheme once."""
+READABLE = 4.5
+"""Least contrast of text, WCAG 2.2 level AA."""
+_CONTRAST = """selector => {
+    const context = document.createElement('canvas').getContext('2d', { willReadFrequently: true });
+    const paint = (colour) => {
+        context.fillStyle = colour;
+        context.fillRect(0, 0, 1, 1);
+        const part = (k) => context.getImageData(0, 0, 1, 1).data[k] / 255;
+        const linear = (c) => c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4;
+        return 0.2126 * linear(part(0)) + 0.7152 * linear(part(1)) + 0.0722 * linear(part(2));
+    };
+    return [...document.querySelectorAll(selector)].filter((e) => e.checkVisibility()).map((e) => {
+        const grounds = [];
+        for (let n = e; n; n = n.parentElement) grounds.push(getComputedStyle(n).backgroundColor);
+        paint('white');
+        const ground = grounds.reverse().map(paint).at(-1);
+        const ink = paint(getComputedStyle(e).color);
+        return (Math.max(ink, ground) + 0.05) / (Math.min(ink, ground) + 0.05);
+    });
+}"""
+
+
+def contrast(page: Page, selector: str) -> float:
+    """Least contrast of visible texts with the backgrounds of their ancestors."""
+    found = page.evaluate(_CONTRAST, selector)
+    assert found, selector
+    return float(min(found))
 
 
 class Site:

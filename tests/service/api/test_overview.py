@@ -109,5 +109,15 @@ def test_the_list_over_http(setup: Setup) -> None:
         service.tick(town.report(T0 + k))
     assert [one["incidents"] for one in http.get("/api/v1/feeders").json()["feeders"]] == [0, 0]
     assert http.get("/api/v1/feeders", params={"text": "VILL"}).json()["feeders"][0]["status"] == "clean"
-    for wrong in ({"order": "best"}, {"limit": 0}, {"offset": -1}, {"status": "bad"}, {"worst": 1}):
+    for wrong in ({"order": "best"}, {"limit": -1}, {"offset": -1}, {"status": "bad"}, {"worst": 1}):
         assert http.get("/api/v1/feeders", params=wrong).status_code == 422
+
+
+def test_a_limit_of_zero_returns_the_numbers_and_the_included_feeder(setup: Setup) -> None:
+    setup.calm(T0, 1)
+    whole = setup.get("/feeders").json()
+    found = setup.get("/feeders", params={"limit": 0, "include": "town"}).json()
+    assert found["counts"] == whole["counts"]
+    assert found["total"] == 2
+    assert [one["name"] for one in found["feeders"]] == ["town"]
+    assert setup.get("/feeders", params={"limit": 0}).json()["feeders"] == []

@@ -17,6 +17,7 @@ from feeders.simulation.plant import MeterErrors
 from feeders.simulation.recording import record
 from feeders.simulation.scenario import Scenario
 from service.cli.study_report import STUDIES, Asked, _command, misplaced
+from tests.feeders.villages import with_long_ids
 from tests.journals import edit, rows
 from tests.service.commands import command, plain, text_of
 
@@ -283,4 +284,34 @@ def test_tables_and_legends_of_all_studies_fit_on_a_phone_and_on_paper(
     page.emulate_media(media="print")
     assert page.evaluate("document.documentElement.scrollWidth") <= 673
     assert max(page.evaluate(wide)) <= 673.5
+    page.close()
+
+
+@pytest.mark.browser
+@pytest.mark.canary("long ids")
+@pytest.mark.parametrize(
+    "feeder", ["simbench-lv-rural1", "kerber-vorstadtnetz"], ids=["long ids", "146 meters"]
+)
+def test_tables_of_many_meters_and_long_ids_stay_on_the_page(
+    browser: Browser,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    feeder: str,
+) -> None:
+    folder = with_long_ids(feeder, tmp_path / "feeder")
+    page_file = tmp_path / "report.html"
+    assert run(monkeypatch, capsys, str(folder), "--out", str(page_file), *FEW)[0] == 0
+    page = browser.new_page()
+    page.goto(page_file.as_uri())
+    page.evaluate("for (const each of document.querySelectorAll('details')) each.open = true")
+    beyond = """width => [...document.querySelectorAll('body *')].filter((e) => !e.closest('.scroll, svg')
+        && e.getBoundingClientRect().right > width + 0.5).map((e) => e.outerHTML.slice(0, 80))"""
+    for width, height in ((1400, 900), (390, 844)):
+        page.set_viewport_size({"width": width, "height": height})
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert page.evaluate(beyond, width) == []
+    # A wide table is scrolled in its own frame, by keyboard, too.
+    for frame in page.locator(".scroll").all():
+        assert frame.get_attribute("tabindex") == "0"
     page.close()

@@ -20,7 +20,9 @@ from feeders.simulation.plant import MeterErrors
 from feeders.simulation.recording import record
 from feeders.simulation.scenario import Scenario
 from gridsec.papers import draw
-from tests.feeders.villages import village_without_inverters
+from service.cli import console
+from service.cli.study_words import cell_text, tables
+from tests.feeders.villages import village_without_inverters, with_long_ids
 from tests.service.commands import command, plain
 
 run = command("study")
@@ -224,3 +226,34 @@ def test_sentence_without_numbers_of_any_estimator() -> None:
         conclusions.conclusion(load("cigre-lv"), "compare", rows)
     )
     assert conclusions.figure(load("cigre-lv"), "compare", rows) is None
+
+
+def test_tables_fit_a_terminal_of_80_columns_and_cut_no_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(console.out, "width", 80)
+    folder = with_long_ids("simbench-lv-rural1", tmp_path / "feeder")
+    code, told, errors = run(
+        monkeypatch, capsys, "redundancy", str(folder), "--no-journal", "--out", str(tmp_path)
+    )
+    assert code == 0, errors
+    drawn = [line for line in told.splitlines() if line[:1] in "┏┃┡│└"]
+    assert 40 < max(map(len, drawn)) <= 80
+    cells = {text.strip() for line in drawn for text in re.split("[│┃]", line)}
+    numbers = pd.read_csv(tmp_path / "redundancy-meters.csv")["index_any"]
+    assert {cell_text(float(number)) for number in numbers} <= cells
+
+
+def test_a_wide_table_is_divided_by_columns() -> None:
+    names = ["meter", *(f"size_number_{k}" for k in range(16))]
+    texts = {name: [f"{1234.5 + k:.6g}" for k in range(3)] for name in names} | {"meter": ["m1", "m2", "m3"]}
+    assert len(tables("Sizes", texts, {"meter"}, 400)) == 1
+    parts = tables("Sizes", texts, {"meter"}, 80)
+    assert [len(part.columns) for part in parts] == [8, 8, 3]
+    assert [column.header for part in parts for column in part.columns if column.header != "meter"] == [
+        name.replace("_", "\n") for name in names[1:]
+    ]
+    assert str(parts[1].title) == "Sizes (2 of 3)"
+    assert all(part.columns[0].header == "meter" for part in parts)
+    # A column wider than the terminal stands alone.
+    assert len(tables("One", {"meter": ["m" * 64], "text": ["x" * 300]}, {"meter"}, 80)) == 1

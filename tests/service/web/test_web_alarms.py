@@ -23,7 +23,7 @@ from service.report.report import (
     with_learning,
 )
 from tests.service.asking import T0
-from tests.service.looking import DESKTOP, PHONE, Site, customer
+from tests.service.looking import LOOKS, READABLE, Site, contrast, customer
 from tests.service.stored import an_alarm, raised
 
 pytestmark = pytest.mark.browser
@@ -74,13 +74,13 @@ def test_an_error_of_the_files_stands_beside_the_accusation(site: Site) -> None:
     expect(page.locator("#detail-card")).to_contain_text("bus drop-9")
 
 
-@pytest.mark.canary("size0")
-@pytest.mark.parametrize("size", [DESKTOP, PHONE])
-def test_a_busbar_meter_that_lies_is_marked(site: Site, size: dict[str, int]) -> None:
+@pytest.mark.canary("desktop")
+@LOOKS
+def test_a_busbar_meter_that_lies_is_marked(site: Site, size: dict[str, int], scheme: str) -> None:
     """In words and shapes, wherever a suspect meter is; and everything is as before once it is believed."""
     honest = BusbarMeterState(True, True, False, (), None, 231.0, 231.0, 0.0)
     site.service.tick(replace(site.village.report(T0), busbar=honest))
-    page = site.open(size)
+    page = site.open(size, color_scheme=scheme)
     note, mark, name = (
         page.locator("#busbar-meter"),
         page.locator(".busbar-liar"),
@@ -99,9 +99,10 @@ def test_a_busbar_meter_that_lies_is_marked(site: Site, size: dict[str, int]) ->
     expect(mark.locator(".sign")).to_have_text("!")
     expect(mark.locator(".note")).to_have_text("+7.0")
     expect(name).to_have_text("◆ Busbar (busbar): 230.9 V")
-    expect(page.locator("#chips")).to_have_text("substation +7.0 V")
+    expect(page.locator("#chips")).to_have_text("substation · busbar meter +7.0 V")
     alarm = page.locator('.alarm:has-text("Meter manipulated")')
-    expect(alarm).to_contain_text("substation · village")
+    expect(alarm).to_contain_text("substation · busbar meter · village")
+    assert contrast(page, ".alarm :is(b, p, a, button, span), .incident :is(b, span)") > READABLE
     expect(alarm).to_contain_text("238.0 V reported, 231.0 V reconstructed (+7.0 V)")
     page.locator("#meters-box summary").click()
     expect(page.locator("#meters tr").first).to_contain_text("substation")

@@ -16,7 +16,7 @@ from service.alarms.incidents import IncidentKind
 from service.api.guide import page as guide
 from service.report.report import BusbarMeterState, DisplayedVerdict, ExplanationReport
 from tests.service.asking import T0
-from tests.service.looking import PHONE, Site
+from tests.service.looking import LOOKS, PHONE, READABLE, Site, contrast
 
 pytestmark = pytest.mark.browser
 
@@ -29,14 +29,15 @@ def shown(site: Site, t: float, displayed: DisplayedVerdict, **changes: Any) -> 
 
 
 @pytest.mark.canary("desktop")
-@pytest.mark.parametrize("size", [WIDE, PHONE], ids=["desktop", "phone"])
-def test_the_displayed_verdict_and_the_latest_tick(site: Site, size: dict[str, int]) -> None:
+@LOOKS
+def test_the_displayed_verdict_and_the_latest_tick(site: Site, size: dict[str, int], scheme: str) -> None:
     attacked = DisplayedVerdict(
         Decision.ATTACKED, T0 - 180, T0, Cause.RESIDUALS, "H3 contradicts the rest.", ("H3",)
     )
     shown(site, T0, attacked, lies={"H3": 9.0})
-    page = site.open(size)
+    page = site.open(size, color_scheme=scheme)
     expect(page.locator("#decision")).to_have_text("ATTACKED")
+    assert contrast(page, "#verdict :is(strong, h2, p, a, .chip, dt, dd)") > READABLE
     expect(page.locator("#since")).to_have_text(re.compile(r"^Since .* \(3 min\)\.$"))
     expect(page.locator("#certainty")).to_contain_text("Strongest evidence at this tick: H3, 6.6 times")
     expect(page.locator("#next a")).to_have_attribute("href", "operator-guide#meter-manipulated")
@@ -47,6 +48,7 @@ def test_the_displayed_verdict_and_the_latest_tick(site: Site, size: dict[str, i
     expect(page.locator("#reason")).to_have_text("H3 contradicts the rest.")
     expect(page.locator("#chips .chip").first).to_have_text("H3 +9.0 V")
     expect(page).to_have_title(re.compile("^ATTACKED"))
+    assert contrast(page, "#verdict :is(strong, h2, p, a, .chip, dt, dd)") > READABLE
     clean = DisplayedVerdict(Decision.CLEAN, T0 + 2, T0 + 2, Cause.AGREEMENT, "All agree.", ())
     shown(site, T0 + 2, clean)
     expect(page.locator("#decision")).to_have_text("CLEAN")
@@ -62,7 +64,9 @@ def test_candidates_of_an_undecided_verdict(site: Site) -> None:
     site.service.tick(replace(report, explanations=ways))
     page = site.open()
     expect(page.locator("#decision")).to_have_text("UNDECIDED")
-    expect(page.locator("#certainty")).to_have_text("Possible: H3 (60 %), or substation (40 %).")
+    expect(page.locator("#certainty")).to_have_text(
+        "Possible: H3 (60 %), or substation · busbar meter (40 %)."
+    )
     expect(page.locator("#next")).to_contain_text("Inspect the candidates, the likeliest first.")
     page.locator("#chips .chip:has-text('candidate H3')").click()
     expect(page.locator("#detail-title")).to_have_text("H3")
@@ -88,11 +92,17 @@ def test_all_suspects_are_reachable(site: Site) -> None:
     expect(page.locator("#series-chart .meter-name")).to_contain_text("substation")
 
 
-@pytest.mark.canary("light")
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_without_a_connection_the_page_is_dimmed_and_states_it(site: Site, scheme: str) -> None:
+@pytest.mark.canary("desktop-light")
+@pytest.mark.parametrize(
+    ("size", "scheme"),
+    [(WIDE, "light"), (WIDE, "dark"), (PHONE, "light"), (PHONE, "dark")],
+    ids=["desktop-light", "desktop-dark", "phone-light", "phone-dark"],
+)
+def test_without_a_connection_the_page_is_dimmed_and_states_it(
+    site: Site, size: dict[str, int], scheme: str
+) -> None:
     site.tick(T0, 2)
-    page = site.open(WIDE, color_scheme=scheme)
+    page = site.open(size, color_scheme=scheme)
     bar, main = page.locator("#offline"), page.locator("#main")
     expect(page.locator("#decision")).to_have_text("CLEAN")
     expect(bar).to_be_hidden()
@@ -103,6 +113,8 @@ def test_without_a_connection_the_page_is_dimmed_and_states_it(site: Site, schem
     expect(main).to_have_attribute("data-link", "lost")
     veil = main.evaluate("e => getComputedStyle(e, '::after').position")
     assert veil == "fixed"
+    assert contrast(page, "#offline") > READABLE
+    assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
     expect(page.locator("#next a")).to_have_attribute("href", "operator-guide#no-data")
     site.server = site.serve(site.service, site.server.port)
     site.tick(T0 + 2)

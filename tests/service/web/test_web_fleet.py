@@ -13,7 +13,7 @@ from playwright.sync_api import Page, expect
 
 from gridsec.interface import Cause
 from tests.service.asking import T0
-from tests.service.looking import DESKTOP, PHONE, Site
+from tests.service.looking import DESKTOP, LOOKS, PHONE, READABLE, Site, contrast
 
 pytestmark = pytest.mark.browser
 
@@ -22,6 +22,16 @@ MOST_ROWS = 60
 """Largest number of drawn rows of the list."""
 PAINT_S = 15.0
 """Time limit of the first list of 1 000 feeders on a busy machine, s."""
+UPDATES = 3
+FOLLOWS_S, REQUESTS = 2.0, 8.0
+"""Limit on a busy machine of the median time from a stored verdict to its number: s, and multiples of a
+request's duration. An idle machine takes about 0.5 s."""
+
+REQUEST_S = """() => {
+    const all = performance.getEntriesByType("resource").filter((each) => each.name.includes("limit=0"));
+    return all.map((each) => each.duration / 1000).sort((a, b) => a - b)[all.length >> 1];
+}"""
+"""Median duration of a request of the numbers, s."""
 
 
 def rows(page: Page) -> list[str]:
@@ -33,9 +43,9 @@ def tick(site: Site, village: Any, t: float, **changes: Any) -> None:
 
 
 @pytest.mark.canary("phone")
-@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+@LOOKS
 def test_the_worst_feeder_comes_first(
-    site_of: Callable[..., Site], village: Callable[..., Any], size: dict[str, int]
+    site_of: Callable[..., Site], village: Callable[..., Any], size: dict[str, int], scheme: str
 ) -> None:
     quiet, doubtful, attacked, dark = (
         village(name, 4) for name in ("a-quiet", "b-doubtful", "c-attacked", "d")
@@ -44,7 +54,7 @@ def test_the_worst_feeder_comes_first(
     tick(site, quiet, T0)
     tick(site, doubtful, T0, cause=Cause.AMBIGUOUS)
     tick(site, attacked, T0, lies={"H1": 9.0, "H2": 9.0})
-    page = site.open(size, "/#a-quiet")
+    page = site.open(size, "/#a-quiet", color_scheme=scheme)
     expect(page.locator("#decision")).to_have_text("CLEAN")
     expect(page.locator("#fleet-rows tr")).to_have_count(4)
     assert [row.split(",")[0] for row in rows(page)] == ["C-attacked", "B-doubtful", "D", "A-quiet"]
@@ -64,9 +74,11 @@ def test_the_worst_feeder_comes_first(
     expect(page.locator("#decision")).to_have_text("ATTACKED")
     expect(page).to_have_title("ATTACKED – C-attacked, 4 customers – gridsec")
     expect(page.locator('#fleet-rows tr[aria-current="true"] th')).to_contain_text("C-attacked")
+    tick(site, attacked, T0 + 1.0, lies={"H1": 9.0, "H2": 9.0})
     tick(site, quiet, T0 + 1.0, lies={"H0": 9.0})
     expect(page).to_have_title("1 ATTACKED | ATTACKED – C-attacked, 4 customers – gridsec")
     expect(page.locator("#fleet-counts")).to_contain_text("2 attacked")
+    assert contrast(page, "#fleet-rows :is(.fleet-state, th button, td.num), #fleet-counts button") > READABLE
     width = page.evaluate("document.documentElement.scrollWidth")
     assert width <= size["width"]
 
@@ -177,12 +189,13 @@ def test_numbers_by_verdict_filter_the_list(
     page = site.open(None, "/#one")
     expect(page.locator("#fleet-rows tr")).to_have_count(3)
     first, second = page.locator("#fleet-rows tr").nth(0), page.locator("#fleet-rows tr").nth(1)
-    expect(first.locator("td").nth(4)).to_have_text("2, 2 new")
+    expect(first.locator("td").nth(4)).to_have_text("1")  # incident of both alarms
+    expect(first.locator("td").nth(5)).to_have_text("2, 2 new")
     expect(second.locator("td").nth(3)).to_have_text("25 %")
     page.locator('.alarm:has-text("H1") button.ack').click()
     page.fill("#act-who", "Ada")
     page.locator("#act-send").click()
-    expect(first.locator("td").nth(4)).to_have_text("2, 1 new")
+    expect(first.locator("td").nth(5)).to_have_text("2, 1 new")
     undecided = page.locator('#fleet-counts button[data-state="undecided"]')
     undecided.click()
     expect(page.locator("#fleet-rows tr")).to_have_count(1)
@@ -193,3 +206,42 @@ def test_numbers_by_verdict_filter_the_list(
     # A page of another feeder than the shown one: one number of attacked feeders everywhere.
     expect(page).to_have_title("1 ATTACKED | NO DATA – One, 4 customers – gridsec")
     expect(page.locator("#feeder option:checked")).to_have_text("NO DATA – One, 4 customers")
+
+
+@pytest.mark.canary("60")
+@pytest.mark.parametrize("count", [60, MANY], ids=["60", "1000"])
+def test_the_overview_follows_within_a_second_also_in_a_hidden_tab(
+    site_of: Callable[..., Site], village: Callable[..., Any], count: int
+) -> None:
+    """The tab is hidden as a browser hides it: `visibilityState`, and no paint."""
+    villages = [village(f"v{k:04d}", 2) for k in range(count)]
+    site = site_of(*villages)
+    live = villages if count == MANY else villages[:20]
+    for each in live:
+        tick(site, each, T0)
+    page = site.open(None, "/#v0001")
+    expect(page.locator('#fleet-counts [data-state="clean"]')).to_have_text(f"{len(live)} clean")
+    painted_ms = page.evaluate("performance.getEntriesByName('first-contentful-paint')[0].startTime")
+    assert painted_ms < 1e3 * PAINT_S
+    waited = []
+    for k in range(UPDATES):
+        tick(site, villages[10 + k], T0 + 1.0, lies={"H1": 9.0})
+        begun = time.monotonic()
+        page.wait_for_selector(f'#fleet-counts [data-state="attacked"]:text-is("{k + 1} attacked")')
+        waited.append(time.monotonic() - begun)
+    request_s = page.evaluate(REQUEST_S)
+    assert sorted(waited)[UPDATES // 2] < FOLLOWS_S + REQUESTS * request_s
+    expect(page.locator("#fleet-rows tr").first).to_contain_text("V0010")
+    page.evaluate(
+        "Object.defineProperty(document, 'visibilityState', { get: () => 'hidden', configurable: true })"
+    )
+    lists: list[str] = []
+    page.wait_for_timeout(800)  # requests of the visible page end
+    page.on("request", lambda request: lists.append(request.url) if "order=worst" in request.url else None)
+    for each in villages[:4]:
+        tick(site, each, T0 + 2.0, lies={"H1": 9.0})
+    expect(page).to_have_title(re.compile(r"^6 ATTACKED \| ATTACKED – V0001"))
+    assert lists == []
+    page.evaluate("delete document.visibilityState; document.dispatchEvent(new Event('visibilitychange'))")
+    expect(page.locator("#feeder option").nth(6)).to_contain_text("ATTACKED")
+    print(f"{count} feeders: paint {painted_ms:.0f} ms, request {request_s:.2f} s, updates {waited} s")

@@ -160,3 +160,57 @@ def test_a_click_survives_news_and_the_search_narrows(site: Site) -> None:
     line(page).locator(".line").click()
     line(page).locator(".body > p a.where").click()
     expect(page.locator("#detail-title")).to_have_text("H5")
+
+
+def test_several_incidents_are_acknowledged_at_once(site_of: Callable[..., Site], village: Any) -> None:
+    site = site_of(village("village"), village("town", 4), village("port", 4))
+    site.service.wall = lambda: T0 + 10
+    for name in ("village", "town", "port"):
+        for k in range(4):
+            site.service.tick(site.service.villages[name].report(T0 + k, lies={"H1": 9.0}))
+    page = site.open(PHONE)
+    expect(page.locator(".incident")).to_have_count(3)
+    expect(page.locator("#incident-chosen")).to_be_hidden()
+    page.get_by_label("Select Manipulation, town").check()
+    line(page, "port").locator(".line").focus()
+    page.keyboard.press("x")
+    expect(page.locator("#incident-chosen-count")).to_have_text("2 selected")
+    # An incident that is extended meanwhile is refused, and stays selected.
+    page.click("#incident-chosen-ack")
+    expect(page.locator("#act-title")).to_have_text("Acknowledge 2 incidents")
+    site.expected = "409"
+    site.service.tick(site.service.villages["port"].report(T0 + 4, lies={"H1": 9.0, "H2": 9.0}))
+    for k in (5, 6, 7):
+        site.service.tick(site.service.villages["port"].report(T0 + k, lies={"H1": 9.0, "H2": 9.0}))
+    page.fill("#act-who", "Ada")
+    page.click("#act-send")
+    expect(page.locator("#act-error")).to_contain_text("port: ")
+    page.click("#act-cancel")
+    expect(page.locator("#incident-chosen-count")).to_have_text("1 selected")
+    expect(line(page, "town")).to_contain_text("acknowledged by Ada")
+    page.click("#incident-chosen-all")
+    expect(page.locator("#incident-chosen-count")).to_have_text("2 selected")
+    page.click("#incident-chosen-ack")
+    fill(page, "one cause")
+    expect(page.locator("#incident-chosen")).to_be_hidden()
+    expect(page.locator("#incident-count")).to_be_hidden()
+    expect(page.locator('.incident[data-state="acknowledged"]')).to_have_count(3)
+    fits(page, PHONE)
+
+
+def test_the_alarm_list_has_a_search_and_severities(site: Site) -> None:
+    site.tick(T0, 20, lies={"H1": 9.0}, silent=("H5",))
+    page = site.open(WIDE)
+    expect(page.locator("#alarm-list .alarm")).to_have_count(2)
+    page.fill("#alarm-text", "h5")
+    expect(page.locator("#alarm-list .alarm")).to_have_count(1)
+    expect(page.locator("#alarm-list .where")).to_contain_text("H5")
+    # A new alarm appears only if the search has it.
+    site.tick(T0 + 20, 4, lies={"H1": 9.0, "H3": 9.0}, silent=("H5",))
+    page.wait_for_timeout(600)
+    expect(page.locator("#alarm-list .alarm")).to_have_count(1)
+    page.fill("#alarm-text", "")
+    expect(page.locator("#alarm-list .alarm")).to_have_count(3)
+    page.select_option("#alarm-severity", "critical")
+    expect(page.locator("#alarm-list .alarm")).to_have_count(2)
+    expect(page.locator('#alarm-list .alarm:not([data-severity="critical"])')).to_have_count(0)

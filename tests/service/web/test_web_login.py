@@ -11,32 +11,34 @@ from playwright.sync_api import Browser, expect
 from service.access.identity import Role
 from service.access.keys import create
 from service.store.access import AccessStore
-from tests.service.looking import DESKTOP, PHONE
+from tests.service.looking import LOOKS, READABLE, contrast
 from tests.service.running import FEEDER, service
 
 pytestmark = pytest.mark.browser
 
 
 @pytest.mark.canary("phone")
-@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+@LOOKS
 def test_the_page_asks_for_a_key_and_shows_the_identity(
-    browser: Browser, tmp_path: Path, size: dict[str, int]
+    browser: Browser, tmp_path: Path, size: dict[str, int], scheme: str
 ) -> None:
     now = time.time()
     text, record = create("Ada", Role.OPERATOR, frozenset({FEEDER}), now, now + 600.0)
     with AccessStore(f"sqlite:///{tmp_path / 'gridsec.db'}") as store:
         store.add_key(record)
     with service(tmp_path) as running:
-        context = browser.new_context(viewport=size)  # type: ignore[arg-type]
+        context = browser.new_context(viewport=size, color_scheme=scheme)  # type: ignore[arg-type]
         page = context.new_page()
         page.set_default_timeout(10_000)
         page.goto(str(running.http.base_url))
         expect(page.locator("#login")).to_be_visible()
+        assert contrast(page, "#login :is(h2, p, label, button, code)") > READABLE
         page.keyboard.press("Escape")
         expect(page.locator("#login")).to_be_visible()
         page.fill("#login-key", "gridsec_0_0")
         page.click("#login-form button")
         expect(page.locator("#login-error")).to_contain_text("not known")
+        assert contrast(page, "#login-error") > READABLE
         page.fill("#login-key", text)
         page.click("#login-form button")
         expect(page.locator("#login")).to_be_hidden()
