@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,48 +18,10 @@ from service.notify.targets import Alertmanager
 from service.store import Store
 from service.store.deliveries import DeliveryStore
 from tests.service.receiver import Receiver, receiving
-from tests.service.running import free_port, until
+from tests.service.running import until
 from tests.service.stored import an_alarm, raised
 
-CONFIGURATION = """
-route: {receiver: page, group_by: [feeder], group_wait: 0s, group_interval: 1s, repeat_interval: 1h}
-receivers:
-- name: page
-  webhook_configs: [{url: "URL", send_resolved: true}]
-"""
 RESEND_S = 2.0
-
-
-@pytest.fixture(scope="module")
-def page() -> Iterator[Receiver]:
-    """Receiver of Alertmanager's own notifications."""
-    with receiving() as made:
-        yield made
-
-
-@pytest.fixture(scope="module")
-def manager(tmp_path_factory: pytest.TempPathFactory, page: Receiver) -> Iterator[str]:
-    program = shutil.which("prometheus-alertmanager") or shutil.which("alertmanager")
-    if program is None:
-        pytest.skip("Alertmanager is not installed")
-    folder = tmp_path_factory.mktemp("alertmanager")
-    (folder / "config.yml").write_text(CONFIGURATION.replace("URL", page.url))
-    url = f"http://127.0.0.1:{free_port()}"
-    files = [f"--config.file={folder}/config.yml", f"--storage.path={folder}/data", "--log.level=error"]
-    command = [program, *files, f"--web.listen-address={url[7:]}", "--cluster.listen-address="]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        try:
-            until(lambda: ready(url), "Alertmanager")
-            yield url
-        finally:
-            process.terminate()
-
-
-def ready(url: str) -> bool:
-    try:
-        return httpx.get(f"{url}/-/ready").status_code == 200
-    except httpx.TransportError:
-        return False
 
 
 def alerts(url: str) -> dict[str, dict[str, Any]]:
