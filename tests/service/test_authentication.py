@@ -80,6 +80,7 @@ def test_without_the_issuer_unknown_keys_get_503_and_api_keys_pass(tmp_path: Pat
         assert live.http.get("/healthz").status_code == 200
 
 
+@pytest.mark.acceptance
 def test_no_service_without_authentication_beyond_loopback(tmp_path: Path) -> None:
     """A real process ends before it listens."""
     command = [

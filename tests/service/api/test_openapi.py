@@ -98,15 +98,15 @@ def generated(output: str) -> int:
     return int(found[1]) if found else 0
 
 
-def test_schemathesis_finds_no_failure_in_lists_and_streams(setup: Setup, tmp_path: Path) -> None:
-    """Of the streams the answer when all are in use: a stream itself has no end."""
+def test_schemathesis_finds_no_failure_in_streams(setup: Setup, tmp_path: Path) -> None:
+    """The answer of streams when all are in use: a stream itself has no end."""
     setup.attack()
     setup.server.api.state.max_streams = 0
     found = schemathesis(
-        setup.server.url, tmp_path, "--phases", "coverage", "--max-examples", "1", "--exclude-method", "POST",
-        "--include-path-regex", "^/api/v1/(shelves|alarms/stream|feeders/[^/]+/stream)$",
+        setup.server.url, tmp_path, "--phases", "coverage", "--max-examples", "1",
+        "--include-path-regex", "/stream$",
     )  # fmt: skip
-    assert generated(found) >= 10
+    assert generated(found) > 20
 
 
 @pytest.mark.acceptance
