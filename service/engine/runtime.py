@@ -386,7 +386,7 @@ class Runtime:
         """Return the numbers of a feeder in the list of feeders; empty before its first tick."""
         monitor = self._engine.monitors.get(name)
         latest = None if monitor is None else monitor.latest
-        return {} if latest is None else {**latest.summary(), "age_s": self.age(latest)}
+        return {} if latest is None else {**latest.summary, "age_s": self.age(latest)}
 
     def age(self, report: FeederReport | TickState) -> float:
         """Return the age of a feeder's latest report by the service's clock, s.

@@ -5,7 +5,7 @@ A calm tick needs no report: nothing is stored or published of it unless it is a
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -105,8 +105,9 @@ class TickState:
         """True if no value uses a voltage reading of this tick."""
         return not self.grounds.measured.any()
 
-    def summary(self) -> dict[str, Any]:
-        """Return the numbers of the list of feeders."""
+    @cached_property
+    def summary(self) -> Mapping[str, Any]:
+        """Numbers of the list of feeders."""
         shown = self.displayed
         return {
             "t": self.t,

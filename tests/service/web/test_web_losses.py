@@ -18,7 +18,7 @@ from tests.service.running import FEEDER, service, until
 pytestmark = pytest.mark.browser
 
 LOSS = 0.2
-SETTLED = 20
+SETTLED = 12
 """Ticks before the first counted one."""
 SHARE = 0.1
 """Largest number of changes of the displayed verdict, relative to those of the raw one."""
@@ -33,7 +33,7 @@ COUNT = """() => {
 
 @pytest.mark.canary("fast")
 @pytest.mark.parametrize(
-    ("ticks", "speed"), [(60, float("inf")), (480, 4.0)], ids=["fast", "two minutes at fourfold speed"]
+    ("ticks", "speed"), [(40, float("inf")), (480, 4.0)], ids=["fast", "two minutes at fourfold speed"]
 )
 def test_the_displayed_verdict_stands_while_readings_are_lost(
     browser: Browser, tmp_path: Path, ticks: int, speed: float
