@@ -34,6 +34,9 @@ from gridsec.estimators.modal.search import Identification, SearchProblem, amoun
 from gridsec.estimators.modal.signatures import Joint
 from gridsec.estimators.modal.static import Static
 
+COUNTED = 1e-5
+"""Weight from which on an explanation counts in the estimate, 1: 100 deviations apart, it adds a tenth."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimator:
@@ -193,13 +196,15 @@ def corrected(before: Sequence[Estimated], T: Sequence[Floats], found: Identific
     found
         The explanations.
     """
+    counted = found.weight >= COUNTED
+    weight = found.weight[counted] / found.weight[counted].sum()
     each = [
         _one(before[model], T[model], found.problems[model], chosen)
-        for model, chosen in zip(found.model, found.chosen, strict=True)
+        for model, chosen in zip(found.model[counted], found.chosen[counted], strict=True)
     ]
     means = np.stack([one.mean for one in each])
-    mean = found.weight @ means
-    spread = found.weight @ (np.stack([one.variance for one in each]) + (means - mean) ** 2)
+    mean = weight @ means
+    spread = weight @ (np.stack([one.variance for one in each]) + (means - mean) ** 2)
     return Estimated(mean, spread)
 
 
