@@ -35,14 +35,14 @@ from gridsec.estimators.modal.search import (
     Identification,
     SearchProblem,
     clusters,
-    penalty,
+    coded,
+    informed,
 )
 
 REFLECTED = 0.01
 """Weight from which on an explanation has mirror images, 1: that of reported explanations."""
 APART = 20.0
 """Cost of one amount in place of several from which on meters are not off alike, 1."""
-_TINY = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,12 +107,17 @@ def reflected(found: Identification, near: Neighbourhoods) -> Identification:
 def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iterator[tuple[Bools, float]]:
     """Mirror images of a set, (q,), and their costs beyond its own."""
     p, b = near.phases.shape
-    read = problem.F.diagonal()[:p] > _TINY
+    read = informed(problem)
     independent = _likelihood(problem, np.flatnonzero(chosen), None)
     for phase in range(b):
         image, column = _of_phase(chosen, near, phase, read)
         if image is not None:
-            more = 0.0 if chosen[phase - b] else penalty(problem, image) - penalty(problem, chosen)
+            more = 0.0
+            if not chosen[phase - b]:
+                both = coded(
+                    np.stack([chosen[:p], image[:p]]), (near.laterals & read).astype(np.float64), read
+                )
+                more = float(both[1] - both[0] + problem.charge[image].sum() - problem.charge[chosen].sum())
             yield image, max(more, 0.0) + _apart(problem, chosen & image, column, independent)
     done = set[bytes]()
     for lateral in near.laterals & read:
