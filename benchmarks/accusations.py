@@ -7,7 +7,8 @@ Every run has 20 honest seconds and 90 seconds of a manipulation, one frame per 
 truth. Situation and seed determine the run: feeder, learned errors (six hours, a tick of 300 s) or accuracy
 classes alone, knowledge of the powers, and size. `matched`: registers and power factors err as the files say.
 `unread`: 5 % of the customers report no power. `loads`: errors of 0.6 kW and 0.2 kvar, known as such. Filters
-skip seeds and do not change the others. `--estimator modal` watches the same data; the linear programs of
+skip seeds and do not change the others; `--feeder` also takes a feeder that is none of the situation's, for
+checks beside those. `--estimator modal` watches the same data; the linear programs of
 `stealthy` then still know the limits of the default monitor.
 
 Per situation: runs; runs with an honest meter accused; most honest meters accused in a run; runs with an
@@ -235,19 +236,23 @@ SITUATIONS = {
 
 
 @cache
-def cells(name: str) -> tuple[tuple[str, Model, bool, float], ...]:
-    """Feeder, model, learned and size of the runs of a situation, in a fixed mixed order."""
+def cells(name: str, feeder: str | None = None) -> tuple[tuple[str, Model, bool, float], ...]:
+    """Feeder, model, learned and size of the runs of a situation, in a fixed mixed order.
+
+    A feeder that is none of the situation's takes the place of all of them.
+    """
     one = SITUATIONS[name]
-    every = list(itertools.product(one.feeders, Model, (False, True), one.sizes))
+    feeders = one.feeders if feeder is None or feeder in one.feeders else (feeder,)
+    every = list(itertools.product(feeders, Model, (False, True), one.sizes))
     order = np.random.default_rng(len(every)).permutation(len(every))
     return tuple(every[k] for k in order)
 
 
-def cell(name: str, seed: int) -> tuple[Setting, float]:
-    """Setting and size of one run."""
-    every = cells(name)
-    feeder, model, learned, size = every[seed % len(every)]
-    return Setting(feeder, model, learned, seed), size
+def cell(name: str, seed: int, feeder: str | None = None) -> tuple[Setting, float]:
+    """Setting and size of one run; feeder as in `cells`."""
+    every = cells(name, feeder)
+    where, model, learned, size = every[seed % len(every)]
+    return Setting(where, model, learned, seed), size
 
 
 @dataclass(slots=True, eq=False)
@@ -285,7 +290,9 @@ class Run:
     trace: list[str] = field(default_factory=list)
 
 
-def run(name: str, seed: int, *, trace: bool = False, estimator: str = SEQUENTIAL) -> Run:
+def run(
+    name: str, seed: int, *, trace: bool = False, estimator: str = SEQUENTIAL, feeder: str | None = None
+) -> Run:
     """Play and watch one run.
 
     Parameters
@@ -296,9 +303,11 @@ def run(name: str, seed: int, *, trace: bool = False, estimator: str = SEQUENTIA
         Whether to keep a line for every tick.
     estimator
         Name of an estimator.
+    feeder
+        As in `cells`.
     """
     begun = time.perf_counter()
-    setting, size = cell(name, seed)
+    setting, size = cell(name, seed, feeder)
     where = site(setting.feeder)
     known = "learned" if setting.learned else "classes"
     out = Run(name, seed, f"{setting.feeder} {setting.model} {known} {size:g}")
@@ -385,8 +394,8 @@ def table(runs: list[Run]) -> str:
 
 def seeds(name: str, asked: argparse.Namespace) -> Iterator[int]:
     """Seeds of the runs that pass the filters."""
-    every = range(asked.seed0, asked.seed0 + asked.runs * len(cells(name)))
-    passing = (seed for seed in every if _passes(cell(name, seed)[0], asked))
+    every = range(asked.seed0, asked.seed0 + asked.runs * len(cells(name, asked.feeder)))
+    passing = (seed for seed in every if _passes(cell(name, seed, asked.feeder)[0], asked))
     return itertools.islice(passing, asked.runs)
 
 
@@ -412,7 +421,12 @@ def main(asked: argparse.Namespace) -> int:
         go = pool.map if asked.processes > 1 else map
         for name in names:
             chosen = list(seeds(name, asked))
-            runs = list(go(partial(run, name, trace=asked.trace, estimator=asked.estimator), chosen))
+            runs = list(
+                go(
+                    partial(run, name, trace=asked.trace, estimator=asked.estimator, feeder=asked.feeder),
+                    chosen,
+                )
+            )
             if not runs:
                 print(f"| {name} | 0 |" + " |" * 11)
                 continue

@@ -34,7 +34,7 @@ from gridsec.estimators.modal.mirrors import Neighbourhoods
 from gridsec.estimators.modal.model import Modes, ResidualModel, modes, residual_model
 from gridsec.estimators.modal.replay import History, Parts, Suspected
 from gridsec.estimators.modal.rivals import Rival
-from gridsec.estimators.modal.search import DOUBT, Identification, SearchProblem, cost, groups, search
+from gridsec.estimators.modal.search import Identification, SearchProblem, cost, groups, search
 from gridsec.estimators.modal.signatures import Columns, Joint
 from gridsec.estimators.modal.static import Static
 from gridsec.estimators.sequential.design import YEAR_S, SequentialDesign
@@ -55,6 +55,8 @@ FARTHER = 5.0
 """Log M of an onset above that of all pinned ones from which on it replaces them, 1; a replay takes time."""
 LASTS = 0.2
 """Standard deviation of a lasting error along an unknown direction, in that of one tick of the filter, 1."""
+ADOPTED = 0.05
+"""Largest weight of sets that need a meter where loads are adopted, 1: a meter may hide its own load."""
 CALM = 0.5
 """Part of the limit of log M below which suspected onsets are given up, 1."""
 
@@ -374,7 +376,7 @@ def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
         The explanations after the same tick.
     """
     found, p = suspicion.found, core.modes.size
-    if found.chosen[0, :p].any() or doubted(found, p) >= DOUBT or not state.rivals:
+    if found.chosen[0, :p].any() or doubted(found, p) >= ADOPTED or not state.rivals:
         return state
     rival = state.rivals[int(found.model[0])]
     after, chosen = rival.filter, found.chosen[0]
@@ -505,14 +507,14 @@ def _searched(core: Core, state: CoreState, row: int) -> Identification:
     open_ = _unknown(state)
     model, gain = _problem(core, _joint(core, _parts(state), row), open_)
     if not state.rivals:
-        return search(model, core.groups)
+        return search(model, core.groups, (), core.near.laterals)
     plain, others = state.rivals[0], state.rivals[1:]
     less = 2.0 * log(PRIOR * len(others) / (1.0 - PRIOR))
     found = []
     for each in others:
         problem, more = _problem(core, each.joint(), open_)
         found.append((problem, 2.0 * (plain.evidence + gain - each.evidence - more) + less))
-    return search(model, core.groups, found)
+    return search(model, core.groups, found, core.near.laterals)
 
 
 def _problem(core: Core, joint: Joint, unknown: Floats | None) -> tuple[SearchProblem, float]:

@@ -37,6 +37,9 @@ from gridsec.estimators.modal.static import Static
 from gridsec.estimators.sequential.output import PENDING, BoundedEstimate, BoundInputs
 from gridsec.interface import Estimate
 
+COUNTED = 1e-5
+"""Weight from which on an explanation counts in the estimate, 1: 100 deviations apart, it adds a tenth."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimator:
@@ -207,18 +210,20 @@ def corrected(before: Sequence[Estimated], T: Sequence[Floats], found: Identific
     found
         The explanations.
     """
-    every = list(zip(found.model.tolist(), found.chosen, strict=True))
+    counted = found.weight >= COUNTED
+    weight = found.weight[counted] / found.weight[counted].sum()
+    every = list(zip(found.model[counted].tolist(), found.chosen[counted], strict=True))
     means = np.stack(
         [
             before[model].mean + T[model][:, chosen] @ mean_amounts(found.problems[model], chosen)
             for model, chosen in every
         ]
     )
-    mean = found.weight @ means
+    mean = weight @ means
 
     def spread() -> Floats:
         each = [before[k].variance + _of_amounts(T[k], found.problems[k], chosen) for k, chosen in every]
-        return np.asarray(found.weight @ (np.stack(each) + (means - mean) ** 2))
+        return np.asarray(weight @ (np.stack(each) + (means - mean) ** 2))
 
     return Estimated(mean, spread)
 

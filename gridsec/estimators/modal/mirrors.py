@@ -25,9 +25,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import lapack
 
-from gridsec.arrays import Bools, Ints, any_of
+from gridsec.arrays import Bools, Ints, any_of, submatrix
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.search import (
     BELIEVED,
@@ -35,14 +35,14 @@ from gridsec.estimators.modal.search import (
     Identification,
     SearchProblem,
     clusters,
-    penalty,
+    coded,
+    informed,
 )
 
 REFLECTED = 0.01
 """Weight from which on an explanation has mirror images, 1: that of reported explanations."""
 APART = 20.0
 """Cost of one amount in place of several from which on meters are not off alike, 1."""
-_TINY = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,12 +107,17 @@ def reflected(found: Identification, near: Neighbourhoods) -> Identification:
 def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iterator[tuple[Bools, float]]:
     """Mirror images of a set, (q,), and their costs beyond its own."""
     p, b = near.phases.shape
-    read = problem.F.diagonal()[:p] > _TINY
+    read = informed(problem)
     independent = _likelihood(problem, np.flatnonzero(chosen), None)
     for phase in range(b):
         image, column = _of_phase(chosen, near, phase, read)
         if image is not None:
-            more = 0.0 if chosen[phase - b] else penalty(problem, image) - penalty(problem, chosen)
+            more = 0.0
+            if not chosen[phase - b]:
+                both = coded(
+                    np.stack([chosen[:p], image[:p]]), (near.laterals & read).astype(np.float64), read
+                )
+                more = float(both[1] - both[0] + problem.charge[image].sum() - problem.charge[chosen].sum())
             yield image, max(more, 0.0) + _apart(problem, chosen & image, column, independent)
     done = set[bytes]()
     for lateral in near.laterals & read:
@@ -160,15 +165,19 @@ def _apart(problem: SearchProblem, rest: Bools, column: Bools, independent: floa
 
 def _likelihood(problem: SearchProblem, at: Ints, alike: Bools | None) -> float:
     """L of faults `at` with independent amounts, and of meters `alike` (p,) with one amount."""
-    y, F, std = problem.y[at], problem.F[np.ix_(at, at)], problem.std[at]
+    n, y, std = at.size, problem.y[at], problem.std[at]
+    F = submatrix(problem.F, at, at)
     if alike is not None:
         together = np.flatnonzero(alike)
-        side = problem.F[together].sum(axis=0)
-        F = np.block([[F, side[at][:, None]], [side[at][None, :], np.array([[side[together].sum()]])]])
-        y = np.append(y, problem.y[together].sum())
-        std = np.append(std, problem.std[0])
+        side, inner = problem.F[together].sum(axis=0), F
+        F = np.empty((n + 1, n + 1))
+        F[:n, :n], F[n, :n], F[:n, n], F[n, n] = inner, side[at], side[at], side[together].sum()
+        y, std = np.append(y, problem.y[together].sum()), np.append(std, problem.std[0])
     if not y.size:
         return 0.0
-    pull = std * y
-    factor, low = cho_factor(np.eye(y.size) + std[:, None] * F * std)
-    return float(2.0 * np.log(factor.diagonal()).sum() - pull @ cho_solve((factor, low), pull))
+    pull, A = std * y, std[:, None] * F * std
+    A[np.diag_indices(y.size)] += 1.0
+    half, found, failed = lapack.dposv(A, pull, lower=True)
+    if failed:
+        raise np.linalg.LinAlgError(failed)
+    return float(2.0 * np.log(half.diagonal()).sum() - pull @ found)

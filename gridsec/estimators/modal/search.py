@@ -15,10 +15,11 @@ neighbours is added or removed at once. The descent starts from nothing, and fro
 when every one of them has a variance of its own (automatic relevance determination). The prior size of the
 meters' faults is then estimated from the set found, and the descent is repeated.
 
-A set of meters that are off by nearly the same amount needs one size instead of k. The likelihood of a set is
-the mean of that with independent amounts and that with amounts alike, which has the charge of a false
-power: loads without a report move neighbours alike as well. Sets with amounts alike have a descent of their
-own, with one amount for all (`Common`): one amount at a time, none of them is worth its penalty.
+A whole lateral may be manipulated at once, with some exceptions: such a set has the penalty of `coded`, if
+that is less. A set of meters that are off by nearly the same amount needs one size instead of k. The
+likelihood of a set is the mean of that with independent amounts and that with amounts alike, which has the
+charge of a false power: loads without a report move neighbours alike as well. Sets with amounts alike have a
+descent of their own, with one amount for all (`Common`): one amount at a time, none is worth its penalty.
 
 **Rivals.** Loads may change in ways that no report shows. The search is also made under each model of
 `gridsec.estimators.modal.rivals`, with the cost of that model by itself. A model that is far from the best
@@ -39,11 +40,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from math import inf, log, log1p
+from math import inf, log
 
 import numpy as np
 from scipy.cluster.hierarchy import linkage
 from scipy.linalg import blas, cho_solve, cholesky, lapack
+from scipy.special import gammaln
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, submatrix
 from gridsec.estimators.modal.model import Modes
@@ -156,6 +158,47 @@ def penalties(meters: int) -> Floats:
     more = 2.0 * np.log((meters - k) / (k + 1.0))
     more = np.where(k >= max(1, meters // 3), np.maximum(more, MAJORITY), more)
     return frozen(np.concatenate([[0.0], np.cumsum(more)]))
+
+
+def coded(sets: Bools, laterals: Floats, read: Bools) -> Floats:
+    """Penalties of sets of meters, by their number or as a lateral with exceptions, (k,).
+
+    A manipulation of a whole lateral, as by its concentrator, with i members left out and o other meters, has
+
+        2 log G + 2 log binom(|g|, i) + 2 log binom(p - |g|, o)
+
+    for G laterals g. The least of these and of `penalties` counts, for sets of at most a third.
+
+    Parameters
+    ----------
+    sets : (k, p)
+        The sets.
+    laterals : (G, p)
+        Members of the laterals, those with readings.
+    read : (p,)
+        Meters with readings: others are no exceptions.
+    """
+    count = np.count_nonzero(sets, axis=1)
+    out, sets, p = penalties(read.size)[count], sets & read, int(np.count_nonzero(read))
+    if not len(laterals):
+        return np.asarray(out)
+    count = np.count_nonzero(sets, axis=1)
+    size = laterals.sum(axis=1).astype(np.intp)
+    inside = (sets @ laterals.T).astype(np.intp)
+    choices = _log_binomials(p)
+    of_lateral = choices[size, size - inside] + choices[p - size, count[:, None] - inside]
+    whole = 2.0 * (log(len(laterals)) + of_lateral.min(axis=1))
+    return np.asarray(np.where(count <= max(1, read.size // 3), np.minimum(out, whole), out))
+
+
+@lru_cache(maxsize=16)
+def _log_binomials(p: int) -> Floats:
+    """Logarithms of binom(n, k) for n and k up to p, (p + 1, p + 1); infinite for k above n."""
+    n, k = np.ogrid[: p + 1, : p + 1]
+    with np.errstate(invalid="ignore"):
+        return frozen(
+            np.where(k > n, inf, gammaln(n + 1.0) - gammaln(k + 1.0) - gammaln(np.maximum(n - k, 0) + 1.0))
+        )
 
 
 def penalty(problem: SearchProblem, chosen: Bools) -> float:
@@ -384,22 +427,26 @@ class Tableau:
         return np.where(impossible | (self.barred & ~self.chosen) | (sign * a <= 0.0), inf, out)
 
     def exchanges(self, out: Ints) -> Floats:
-        """Change of the cost by exchanging chosen meters `out` for other meters, (k, p); inf for itself.
+        """Change of the cost by exchanging chosen faults `out` for others, (k, q); inf for itself.
 
         Parameters
         ----------
         out : (k,)
-            Chosen meters.
+            Chosen faults.
         """
-        p, q = self.problem.meters, self.chosen.size
-        a, v = self.A.diagonal()[:p], self.A[:p, q]
-        rows = self.A[out, :p] / a[out][:, None]
+        p, q, k = self.problem.meters, self.chosen.size, self.count
+        a, v = self.A.diagonal()[:q], self.A[:q, q]
+        rows = self.A[out, :q] / a[out][:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
-            pivot = a - rows * self.A[out, :p]
+            pivot = a - rows * self.A[out, :q]
             pull = v - rows * v[out][:, None]
-            first = -(v[out] ** 2) / a[out] + np.log(-a[out]) - self.size[out]
-            both = first[:, None] - pull**2 / pivot + np.log(pivot) + self.size[:p]
-        return np.where(self.chosen[:p] | self.barred[:p] | ~(pivot > 0.0), inf, both)
+            first = -(v[out] ** 2) / a[out] + np.log(-a[out]) - self.size[out] - self.problem.charge[out]
+            both = first[:, None] - pull**2 / pivot + np.log(pivot) + self.size + self.problem.charge
+            impossible = np.abs(pull) > self.problem.bound * np.abs(pivot)
+        meter = np.arange(q) < p
+        count = k - meter[out][:, None] + meter
+        both += self.penalty[np.minimum(count, p)] - self.penalty[k]
+        return np.where(self.chosen | self.barred | impossible | ~(pivot > 0.0), inf, both)
 
     def toggled(self, members: Ints, inside: Bools) -> Floats:
         """Change of the cost by toggling sets of meters, (k,).
@@ -570,8 +617,8 @@ _GAIN = 1e-9
 
 
 def _exchanged(tableau: Tableau) -> bool:
-    """Make the best exchange of two meters, if one helps."""
-    out = np.flatnonzero(tableau.chosen[: tableau.problem.meters])
+    """Make the best exchange of two faults, if one helps."""
+    out = np.flatnonzero(tableau.chosen)
     if not out.size:
         return False
     both = tableau.exchanges(out)
@@ -626,6 +673,7 @@ def search(
     problem: SearchProblem,
     groups: tuple[Ints, ...] = (),
     rivals: Sequence[tuple[SearchProblem, float]] = (),
+    laterals: Bools | None = None,
 ) -> Identification:
     """Find the likeliest sets and the meters without which nothing explains the readings.
 
@@ -637,16 +685,21 @@ def search(
         Groups of neighbours, places of meters.
     rivals
         The problem under other models of the loads, and the cost of each by itself.
+    laterals : (G, p)
+        Members of the laterals that may be manipulated as a whole; None: none.
     """
     batches = together(groups)
+    read = informed(problem)
+    whole = np.zeros((0, problem.meters)) if laterals is None else (laterals & read).astype(np.float64)
     start = relevant(problem)
     ends = [_descended(problem, (np.zeros_like(start), start), batches)]
     for other, _ in rivals:
         ends.append(_descended(other, (np.zeros_like(start), ends[0].chosen), batches))
-    one_amount = [in_common(end.problem, groups, end.chosen) for end in ends]
+    one_amount = [in_common(end.problem, whole, end.chosen) for end in ends]
     more = (0.0, *(cost for _, cost in rivals))
     least = [
-        min(end.cost, float(costs(end.problem, sets, ALIKE).min(initial=inf))) + cost
+        min(end.cost, float((costs(end.problem, sets, ALIKE) - _less(sets, whole, read)).min(initial=inf)))
+        + cost
         for end, sets, cost in zip(ends, one_amount, more, strict=True)
     ]
     found = []
@@ -656,8 +709,21 @@ def search(
         else:
             met = {end.chosen.tobytes(): end.cost}
             _with_amounts_alike(end.problem, met, sets[:1])
-        found.append({key: value + cost for key, value in met.items()})
+        keys = list(met)
+        less = _less(np.stack([np.frombuffer(key, dtype=np.bool_) for key in keys]), whole, read)
+        found.append({key: met[key] + cost - float(one) for key, one in zip(keys, less, strict=True)})
     return _identified(tuple(end.problem for end in ends), tuple(found))
+
+
+def _less(sets: Bools, laterals: Floats, read: Bools) -> Floats:
+    """Excess of the penalties by numbers of meters over `coded`, (k,)."""
+    meters = sets[:, : read.size]
+    return np.asarray(penalties(read.size)[np.count_nonzero(meters, axis=1)] - coded(meters, laterals, read))
+
+
+def informed(problem: SearchProblem) -> Bools:
+    """Meters with readings since the onset, (p,): the information about others is zero."""
+    return np.asarray(problem.F.diagonal()[: problem.meters] > np.finfo(np.float64).tiny)
 
 
 def _descended(problem: SearchProblem, starts: tuple[Bools, ...], groups: Groups) -> Tableau:
@@ -730,89 +796,70 @@ def _with_amounts_alike(problem: SearchProblem, found: dict[bytes, float], more:
 
 
 class Common:
-    """A set of meters that are off by one amount, and the costs of all sets near it.
+    """A lateral with exceptions that is off by one amount, and the costs of all sets near it.
 
     The scores and the information of the one amount are ``a = 1' y_J`` and ``b = 1' F_JJ 1``:
 
         cost(J) = -a^2 / (b + 1 / s^2) + log(1 + s^2 b) + penalty(J)
 
+    with the penalty of `coded` for this lateral, or that of the number of meters.
+
     Parameters
     ----------
     problem
         The problem.
-    groups : (g, p)
-        Members of the groups.
+    lateral : (p,)
+        Members of the lateral; none: the penalty of the number counts.
     inside : (p,)
         The set.
     """
 
-    def __init__(self, problem: SearchProblem, groups: Floats, inside: Bools) -> None:
+    def __init__(self, problem: SearchProblem, lateral: Bools, inside: Bools) -> None:
         p = problem.meters
         self.y, self.F, self.s2 = problem.y[:p], problem.F[:p, :p], float(problem.std[0]) ** 2
-        self.penalty, self.groups, self.most = penalties(p), groups, p // 2
-        self.inside = inside.copy()
-        self._set()
-
-    def _set(self) -> None:
+        self.penalty, self.lateral, self.inside = penalties(p), lateral, inside.copy()
+        self.size, self.choices = int(lateral.sum()), _log_binomials(p)
+        self.read = informed(problem)
+        self.others = int(np.count_nonzero(self.read & ~lateral))
         self.rows = self.F @ self.inside
         self.a, self.b = float(self.y @ self.inside), float(self.rows @ self.inside)
         self.count = int(self.inside.sum())
+        self.kept = int(np.count_nonzero(self.inside & lateral))
 
-    def _costs(self, a: Floats, b: Floats, count: Ints) -> Floats:
-        good = (count > 0) & (count <= self.most)
+    def _costs(self, a: Floats, b: Floats, count: Ints, kept: Ints) -> Floats:
         b = np.maximum(b, 0.0)
-        out = -a * a / (b + 1.0 / self.s2) + np.log1p(self.s2 * b) + self.penalty[np.where(good, count, 0)]
-        return np.where(good, out, inf)
+        out = -a * a / (b + 1.0 / self.s2) + np.log1p(self.s2 * b)
+        if self.size:
+            left, other = self.choices[self.size], self.choices[self.others]
+            out += 2.0 * (left[self.size - kept] + other[count - kept])
+        else:
+            out += self.penalty[count]
+        return np.where(count > 0, out, inf)
 
     @property
     def cost(self) -> float:
-        """Cost of the set."""
-        if not 0 < self.count <= self.most:
-            return inf
-        b = max(self.b, 0.0)
-        return -(self.a**2) / (b + 1.0 / self.s2) + log1p(self.s2 * b) + float(self.penalty[self.count])
+        """Cost of the set, without that of the choice of the lateral."""
+        each = np.array([self.a]), np.array([self.b]), np.array([self.count]), np.array([self.kept])
+        return float(self._costs(*each)[0])
 
     def toggled(self) -> Floats:
         """Cost after toggling each meter, (p,)."""
-        sign = np.where(self.inside, -1.0, 1.0)
+        sign = np.where(self.inside, -1, 1)
         b = self.b + 2.0 * sign * self.rows + self.F.diagonal()
-        return self._costs(self.a + sign * self.y, b, self.count + np.where(self.inside, -1, 1))
+        out = self._costs(self.a + sign * self.y, b, self.count + sign, self.kept + sign * self.lateral)
+        return np.where(self.read, out, inf)
 
-    def grouped(self) -> Floats:
-        """Cost after adding the rest of each group, and after removing each group, (2, g)."""
-        out = []
-        for sign, free in ((1.0, ~self.inside), (-1.0, self.inside)):
-            some = self.groups * free
-            b = self.b + 2.0 * sign * (some @ self.rows) + ((some @ self.F) * some).sum(axis=1)
-            count = self.count + (sign * some.sum(axis=1)).astype(np.intp)
-            out.append(self._costs(self.a + sign * (some @ self.y), b, count))
-        return np.stack(out)
-
-    def descend(self, met: set[bytes] | None = None) -> bool:
-        """Lower the cost by meters and groups until none of them helps; False at a set that was met before.
-
-        Parameters
-        ----------
-        met
-            Sets that descents have passed; it is changed.
-        """
+    def descend(self) -> Common:
+        """Lower the cost by single meters until none of them helps."""
+        cost = self.cost
         for _ in range(4 * self.inside.size):
-            if met is not None:
-                if self.inside.tobytes() in met:
-                    return False
-                met.add(self.inside.tobytes())
-            one, cost = self.toggled(), self.cost
+            one = self.toggled()
             j = int(one.argmin())
-            if one[j] < cost - _GAIN:
-                self._toggle(j)
-                continue
-            some = self.grouped()
-            if some.min(initial=inf) >= cost - _GAIN:
+            if not one[j] < cost - _GAIN:
                 break
-            remove, g = np.unravel_index(int(some.argmin()), some.shape)
-            self.inside[self.groups[g] > 0.0] = not remove
-            self._set()
-        return True
+            self._toggle(j)
+            cost = float(one[j])
+        return self
 
     def _toggle(self, j: int) -> None:
         sign = -1.0 if self.inside[j] else 1.0
@@ -820,35 +867,33 @@ class Common:
         self.b += 2.0 * sign * float(self.rows[j]) + float(self.F[j, j])
         self.rows += sign * self.F[j]
         self.count += int(sign)
+        self.kept += int(sign * self.lateral[j])
         self.inside[j] = not self.inside[j]
 
 
-def in_common(problem: SearchProblem, groups: tuple[Ints, ...], best: Bools) -> Bools:
+def in_common(problem: SearchProblem, laterals: Floats, best: Bools) -> Bools:
     """Sets of meters that are off by nearly one amount, with those that differ by one meter, (k, q).
 
     Parameters
     ----------
     problem
         The problem.
-    groups
-        Groups of neighbours.
+    laterals : (G, p)
+        Members of the laterals.
     best : (q,)
         The best set with independent amounts.
     """
     p, out = problem.meters, dict[bytes, Bools]()
-    members = np.zeros((len(groups), p))
-    for k, each in enumerate(groups):
-        members[k, each] = 1.0
     none = np.zeros(p, dtype=np.bool_)
-    starts = [best[:p]] if best[:p].any() else []
-    if groups:
-        first = Common(problem, members, none).grouped()[0]
-        starts += [members[k] > 0.0 for k in np.argsort(first, kind="stable")[:_COMMON]]
-    met = set[bytes]()
+    starts = [Common(problem, none, best[:p] & informed(problem))] if best[:p].any() else []
+    if len(laterals):
+        a, b = laterals @ problem.y[:p], ((laterals @ problem.F[:p, :p]) * laterals).sum(axis=1)
+        first = a * a / (np.maximum(b, 0.0) + problem.std[0] ** -2.0)
+        for k in np.argsort(-first, kind="stable")[:_COMMON]:
+            lateral = laterals[k] > 0.0
+            starts.append(Common(problem, lateral, lateral))
     for start in starts:
-        end = Common(problem, members, start)
-        if not end.descend(met):
-            continue
+        end = start.descend()
         near = end.toggled() < end.cost - 2.0 * log(BELIEVED)
         for j in (-1, *np.flatnonzero(near)):
             chosen = np.zeros(problem.y.size, dtype=np.bool_)
@@ -859,8 +904,8 @@ def in_common(problem: SearchProblem, groups: tuple[Ints, ...], best: Bools) -> 
     return np.stack(list(out.values())) if out else np.zeros((0, problem.y.size), dtype=np.bool_)
 
 
-_COMMON = 4
-"""Number of groups from which a descent with one amount starts: the cheapest ones."""
+_COMMON = 8
+"""Number of laterals from which a descent with one amount starts: those with the best fit."""
 
 
 def _best(starts: tuple[Tableau, ...], groups: Groups) -> Tableau:
@@ -918,7 +963,7 @@ def _neighbours(best: Tableau, found: dict[bytes, float], least: float = BELIEVE
         chosen = best.chosen.copy()
         chosen[j] = not chosen[j]
         found.setdefault(chosen.tobytes(), best.cost + float(change[j]))
-    out = np.flatnonzero(best.chosen[: best.problem.meters])
+    out = np.flatnonzero(best.chosen)
     if not out.size:
         return
     both = best.exchanges(out)

@@ -72,8 +72,9 @@ def test_costs_changes_and_exchanges_are_exact(seed: int) -> None:
             other = tableau.chosen.copy()
             other[j] = not other[j]
             assert tableau.cost + change == pytest.approx(s.cost(given, other), abs=1e-7)
-        out = np.flatnonzero(tableau.chosen[: given.meters])
+        out = np.flatnonzero(tableau.chosen)
         both = tableau.exchanges(out)
+        assert both.shape == (out.size, given.y.size)
         for i, j in zip(*np.nonzero(np.isfinite(both)), strict=True):
             other = tableau.chosen.copy()
             other[out[i]], other[j] = False, True
@@ -150,35 +151,46 @@ def test_costs_of_amounts_alike_are_exact(seed: int) -> None:
             assert found == pytest.approx(exact, abs=1e-7)
 
 
+@pytest.mark.parametrize("whole", [False, True])
 @pytest.mark.parametrize("seed", range(3))
-def test_costs_of_one_amount_are_exact(seed: int) -> None:
-    """Every toggle and every group against the cost of one fault that is the sum of the columns."""
+def test_costs_of_one_amount_are_exact(seed: int, whole: bool) -> None:
+    """Every toggle against the cost of one fault that is the sum of the columns."""
     given, random = problem(seed), np.random.default_rng(seed)
     p = given.meters
-    groups = (random.random((5, p)) < 0.4).astype(np.float64)
+    lateral = np.arange(p) < (5 if whole else 0)
 
     def exact(inside: Bools) -> float:
-        k = int(inside.sum())
-        if not 0 < k <= p // 2:
+        k, kept = int(inside.sum()), int((inside & lateral).sum())
+        if not k:
             return np.inf
-        u = np.append(inside, np.zeros(given.y.size - p))
+        u = np.append(inside.astype(np.float64), np.zeros(given.y.size - p))
         one = SearchProblem(
             np.array([u @ given.y]), np.array([[u @ given.F @ u]]), given.std[:1], 1, np.zeros(1), np.ones(1)
         )
-        return s.cost(one, np.ones(1, dtype=np.bool_)) + s.penalties(p)[k]
+        exceptions = 2.0 * np.log(comb(5, kept) * comb(p - 5, k - kept)) if whole else s.penalties(p)[k]
+        return s.cost(one, np.ones(1, dtype=np.bool_)) + exceptions
 
-    common = s.Common(given, groups, random.random(p) < 0.4)
-    for _ in range(4):
-        for j, found in enumerate(common.toggled()):
-            assert found == pytest.approx(exact(common.inside ^ (np.arange(p) == j)), abs=1e-8)
-        added, removed = common.grouped()
-        for k, group in enumerate(groups > 0.0):
-            assert added[k] == pytest.approx(exact(common.inside | group), abs=1e-8)
-            assert removed[k] == pytest.approx(exact(common.inside & ~group), abs=1e-8)
-        before = common.cost
-        common.descend()
-        assert common.cost <= before
-        assert common.cost == pytest.approx(exact(common.inside), abs=1e-8)
+    common = s.Common(given, lateral, random.random(p) < 0.4)
+    before = common.cost
+    for j, found in enumerate(common.toggled()):
+        assert found == pytest.approx(exact(common.inside ^ (np.arange(p) == j)), abs=1e-8)
+    common.descend()
+    assert common.cost <= before
+    assert common.cost == pytest.approx(exact(common.inside), abs=1e-8)
+
+
+def test_a_lateral_with_exceptions_has_the_least_penalty() -> None:
+    """By binomials; meters without readings are no exceptions, and no laterals change nothing."""
+    laterals = np.zeros((2, 30))
+    laterals[0, :8], laterals[1, 10:14] = 1.0, 1.0
+    read = np.arange(30) != 29
+    sets = np.zeros((4, 30), dtype=np.bool_)
+    sets[0, 1:8], sets[1, 20], sets[2, [*range(8), 25, 29]], sets[3, :11] = True, True, True, True
+    got, by_number = s.coded(sets, laterals, read), s.penalties(30)[[7, 1, 10, 11]]
+    assert got[0] == pytest.approx(2.0 * np.log(2 * 8))
+    assert got[2] == pytest.approx(2.0 * np.log(2 * 21))
+    assert np.allclose(got[[1, 3]], by_number[[1, 3]])
+    assert np.allclose(s.coded(sets, laterals[:0], read), by_number)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -190,10 +202,11 @@ def test_a_group_that_is_off_by_one_amount_is_one_hypothesis(seed: int) -> None:
     f = np.where(np.arange(p) // 12 == 2, 2.0, 0.0)
     y = F @ f + np.linalg.cholesky(F) @ random.standard_normal(p)
     given, truth = SearchProblem(y, F, np.ones(p), p, np.zeros(p), np.full(p, np.inf)), f > 0.0
-    found = s.in_common(given, groups, np.zeros(p, dtype=np.bool_))
+    laterals = np.array([np.isin(np.arange(p), each) for each in groups])
+    found = s.in_common(given, laterals.astype(np.float64), np.zeros(p, dtype=np.bool_))
     assert s.costs(given, found, s.ALIKE).min() <= s.costs(given, truth[None], s.ALIKE)[0] + 1e-9
     assert s.costs(given, truth[None], s.ALIKE)[0] < s.cost(given, truth)
-    assert not (s.search(given, groups).named & ~truth).any()
+    assert not (s.search(given, groups, (), laterals).named & ~truth).any()
 
 
 def test_large_faults_are_named_and_nothing_else() -> None:
