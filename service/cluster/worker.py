@@ -167,10 +167,12 @@ class Member:
                 balance_at = time.monotonic() + BALANCE_S
             await asyncio.sleep(POLL_S)
 
-    def _refresh(self) -> None:
+    def _refresh(self) -> bool:
+        """Read the feeders of the database; True after success."""
         self._catalogue.refresh()
         # The time of a tick grows with the meters.
         self._leases.weigh({name: 1.0 + len(one.meters) for name, one in self._catalogue.feeders.items()})
+        return True
 
     def _wanted(self) -> set[str]:
         held = self._leases.held
@@ -197,6 +199,9 @@ class Member:
 
     async def _adopt(self, host: Host, readings: Readings, names: Collection[str]) -> None:
         began = time.monotonic()
+        # An earlier owner may have stored newer tables before the claim.
+        if not await self._asked("read the feeders of", self._refresh):
+            return
         found = await asyncio.to_thread(self._catalogue.sites, names)
         self._unloaded |= {name: one for name, one in found.items() if isinstance(one, str)}
         sites = [one for one in found.values() if isinstance(one, Site)]

@@ -394,14 +394,17 @@ class Engine:
     ) -> Future[list[FeederMonitor]]:
         """Go on with feeders of another owner: their state and standing alarms.
 
-        `installed` is called with each monitor. Raises StoreUnavailable if the database cannot be read; no
-        feeder is taken over then.
+        A feeder that is monitored by then keeps its monitor: its tables are the same or newer. `installed`
+        is called with each new monitor. Raises StoreUnavailable if the database cannot be read; no feeder is
+        taken over then.
         """
         answer: Future[list[FeederMonitor]] = Future()
 
         def take(found: Sequence[Handover]) -> None:
             made = []
             for site, handover in zip(sites, found, strict=True):
+                if site.feeder.name in self.monitors:
+                    continue
                 made.append(self.add(site, handover.state))
                 self._take_over(handover)
                 installed(made[-1])
