@@ -181,7 +181,9 @@ class Member:
     async def _reconcile(self, host: Host, readings: Readings) -> None:
         """Monitor exactly the feeders of the held shards."""
         wanted = self._wanted()
-        gone, new = self._ours - wanted, wanted - self._ours - self._unloaded.keys()
+        # A command that ends after the release of its shard leaves a monitor without a lease.
+        monitored = {name for name in self._catalogue.feeders if host.known(name)}
+        gone, new = (self._ours | monitored) - wanted, wanted - self._ours - self._unloaded.keys()
         for name in gone:
             readings.unfollow(name)
         self._ours -= gone

@@ -111,3 +111,13 @@ def test_tables_stored_before_the_claim_are_taken_over(store: Store, site: Site)
     asyncio.run(member_of(Shards(NAME), catalogue)._reconcile(host, host))
     assert host.sites[NAME].tables.meta.title == "new"
     assert host.followed == {NAME}
+
+
+def test_a_monitor_without_a_lease_is_ended(store: Store, site: Site) -> None:
+    store.commit(put=(NAME, titled(site, "put")))
+    catalogue, host = Catalogue(store), Monitors()
+    # A feeder that the catalogue does not list yet is the result of a command.
+    host.sites = {NAME: site, "new": site}
+    catalogue.refresh()
+    asyncio.run(member_of(Shards(), catalogue)._reconcile(host, host))
+    assert host.sites.keys() == {"new"}
