@@ -25,7 +25,7 @@ from gridsec.interface import Cause, Decision
 from service.access.identity import OPEN
 from service.alarms.state_machine import Alarm, AlarmUnknown
 from service.cluster.catalogue import Catalogue
-from service.cluster.forward import Forwarder, Workers, get
+from service.cluster.forward import DESIGN_S, Forwarder, Workers, get
 from service.cluster.messages import Call
 from service.engine.commissioning import CommissioningProgress
 from service.engine.operators import Operators
@@ -193,26 +193,28 @@ class Front:
             tables = json.loads(json.dumps(to_json(site.tables)))
             while True:
                 listed = self._catalogue.feeders.get(name)
-                if listed is not None and listed.tables == tables:
-                    break
-                if await self._put(name, tables):
-                    break
-                await asyncio.sleep(PUT_AGAIN_S)
-            self._missing.discard(name)
+                stored = listed is not None and listed.tables == tables
+                if not stored and (stored := await self._put(name, tables)) is None:
+                    await asyncio.sleep(PUT_AGAIN_S)
+                    continue
+                if stored:
+                    self._missing.discard(name)
+                break
 
-    async def _put(self, name: str, tables: Mapping[str, Any]) -> bool:
+    async def _put(self, name: str, tables: Mapping[str, Any]) -> bool | None:
+        """True if the owner has stored the tables, False if it refuses them, None without an outcome."""
         body = json.dumps(tables).encode()
         headers = (("content-type", "application/json"), ("accept", "application/json"))
         try:
-            answer = await self._forwarder.ask(
-                name, Call("PUT", f"/api/v1/feeders/{name}", "", headers, body, OPEN)
-            )
+            call = Call("PUT", f"/api/v1/feeders/{name}", "", headers, body, OPEN)
+            answer = await self._forwarder.ask(name, call, DESIGN_S)
         except (NoOwner, StoreUnavailable):
-            return False
+            return None
         if 400 <= answer.status < 500:
             detail = json.loads(answer.body or b"{}").get("detail")
             _log.error("a feeder of the command line is refused", feeder=name, problem=detail)
-        return answer.status == 200
+            return False
+        return True if answer.status == 200 else None
 
     def stop(self) -> None:
         """End `run` and every subscription soon; called from the event loop."""
