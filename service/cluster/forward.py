@@ -138,7 +138,7 @@ class Forwarder:
     store: database, to find the feeder of an alarm.
     given: feeders of the command line, which REST cannot delete.
     names: names of all feeders.
-    refresh: reads them again, after one was put or deleted.
+    refresh: reads the feeders and events of the database, after each command.
     max_feeders: largest number of feeders added over REST.
     """
 
@@ -166,6 +166,14 @@ class Forwarder:
 
         Raises NoOwner, OutcomeUnknown, FeederFixed, TooManyFeeders.
         """
+        found = await self._forwarded(request, identity, route, body)
+        if found is not None and request.method not in {"GET", "HEAD"}:
+            await self._refresh()
+        return found
+
+    async def _forwarded(
+        self, request: Request, identity: Identity, route: str, body: bytes
+    ) -> Response | None:
         call = self._call(request, identity, body)
         if route == _BULK:
             return await self._acknowledge(call)
@@ -174,10 +182,7 @@ class Forwarder:
             return None
         self._permit(route, feeder)
         limit_s = DESIGN_S if route == f"PUT {_FEEDER}" else ANSWER_S
-        answer = await self.ask(feeder, call, limit_s)
-        if route in {f"PUT {_FEEDER}", f"DELETE {_FEEDER}"}:
-            await self._refresh()
-        return _response(answer)
+        return _response(await self.ask(feeder, call, limit_s))
 
     def _permit(self, route: str, feeder: str) -> None:
         """Check the rules for the whole fleet."""

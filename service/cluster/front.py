@@ -34,6 +34,7 @@ from service.metrics import Metrics
 from service.report.feeder_info import Ownership
 from service.report.report import FeederReport
 from service.store import Store, StoreUnavailable
+from service.store.incidents import suppression_mark
 
 _SAMPLE = re.compile(rb"^([A-Za-z_:][A-Za-z0-9_:]*)(?:\{(.*)\})? (.+)$")
 """A sample: name, labels, value with an optional time."""
@@ -88,6 +89,17 @@ _log = structlog.get_logger("gridsec.cluster")
 class ObservedStore(Store):
     """Database of a front, which writes nothing."""
 
+    _mark: tuple[tuple[float, ...], ...] = ()
+
+    def refresh(self) -> None:
+        """Read the newest events, and count changes of shelves and planned works."""
+        super().refresh()
+        with self._read() as connection:
+            mark = suppression_mark(connection)
+        if mark != self._mark:
+            self._mark = mark
+            self._suppression_changes += 1
+
     def check(self) -> None:
         """Test a read. Raises StoreUnavailable if the database does not answer."""
         self.refresh()
@@ -125,6 +137,7 @@ class Front:
         self._missing = set(given)
         self._problem: str | None = None
         self._registered: list[str] = []
+        self._newest = (store.last_event, store.last_incident_event)
         self._read = asyncio.Event()
         self._subscribers: set[asyncio.Queue[str]] = set()
         self._stopping = asyncio.Event()
@@ -166,16 +179,21 @@ class Front:
     async def _follow(self) -> None:
         """Read the numbers of the newest events, and wake streams after a change."""
         while True:
-            before = (self.store.last_event, self.store.last_incident_event)
             with contextlib.suppress(StoreUnavailable):  # `refresh` reports it
-                await asyncio.to_thread(self.store.refresh)
-            if before != (self.store.last_event, self.store.last_incident_event):
-                self._notify("alarm")
+                await self._read_events()
             await asyncio.sleep(POLL_S)
 
+    async def _read_events(self) -> None:
+        await asyncio.to_thread(self.store.refresh)
+        newest = (self.store.last_event, self.store.last_incident_event)
+        if newest != self._newest:
+            self._newest = newest
+            self._notify("alarm")
+
     async def refresh(self) -> None:
-        """Read the feeders of the database."""
+        """Read the feeders and the newest events of the database."""
         try:
+            await self._read_events()
             changes = await asyncio.to_thread(self._catalogue.refresh)
             self._registered = await asyncio.to_thread(self._live_workers)
         except StoreUnavailable as error:
