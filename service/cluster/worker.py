@@ -304,7 +304,11 @@ async def work(
         store = stack.enter_context(Store(settings.database, leases=leases))
         member = Member(leases, Catalogue(store))
         config = replace(
-            runtime_config(settings), max_feeders=NO_LIMIT, ownership=member.ownership, acts=member.acts
+            runtime_config(settings),
+            max_feeders=NO_LIMIT,
+            ownership=member.ownership,
+            rejects_unknown=False,
+            acts=member.acts,
         )
         runtime = Runtime(config, store, (), given=(), wall=wall, settled=settled)
         bus = bus_of(settings, shares, runtime.deliver, missed=None, wall=wall, everything=False)

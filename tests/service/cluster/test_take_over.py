@@ -16,6 +16,7 @@ from feeders.model.site import Site, load
 from service.cluster.catalogue import Catalogue
 from service.cluster.worker import Member
 from service.engine.engine import Engine, RuntimeConfig
+from service.ingest.queues import Sample
 from service.store import Store
 from service.store.leases import Lease, shard_of
 
@@ -38,8 +39,10 @@ def titled(site: Site, title: str) -> dict[str, Any]:
     return to_json(replace(site.tables, meta=replace(site.tables.meta, title=title)))
 
 
-def engine_of(store: Store) -> Engine:
-    return Engine(RuntimeConfig(), store, (), wall=time.time, stored=lambda: None)
+def engine_of(store: Store, *, rejects_unknown: bool = True) -> Engine:
+    return Engine(
+        RuntimeConfig(rejects_unknown=rejects_unknown), store, (), wall=time.time, stored=lambda: None
+    )
 
 
 class Shards:
@@ -121,3 +124,15 @@ def test_a_monitor_without_a_lease_is_ended(store: Store, site: Site) -> None:
     catalogue.refresh()
     asyncio.run(member_of(Shards(), catalogue)._reconcile(host, host))
     assert host.sites.keys() == {"new"}
+
+
+@pytest.mark.parametrize("rejects", [True, False])
+def test_readings_during_a_hand_over_are_not_rejected(store: Store, rejects: bool) -> None:
+    now = time.time()
+    readings = [
+        Sample(f"gridsec/{source}/reading", b"{}", "application/json", now, 2)
+        for source in ("gone/meter/m01", "gone/substation", "gone/substation/other")
+    ]
+    engine_of(store, rejects_unknown=rejects).cycle(readings)
+    reasons = [one.reason.partition(":")[0] for one in store.rejected()]
+    assert reasons == ["key", *(["unknown-feeder"] * 2 if rejects else [])]
