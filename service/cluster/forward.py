@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import threading
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -124,6 +125,9 @@ WATCH_S: Final = 0.1
 """Interval at which the owner is compared while an answer is under way, s."""
 FORWARDS: Final = 64
 """Largest number of requests that wait for workers at a time."""
+BULK_MOST: Final = 1000
+"""Largest number of alarms of one acknowledgement."""
+_ID: Final = re.compile(r"[0-9A-Z]{26}")
 _BULK: Final = "POST /api/v1/alarms/ack"
 _FEEDER: Final = "/api/v1/feeders/{feeder}"
 
@@ -178,7 +182,8 @@ class Forwarder:
         if route == _BULK:
             return await self._acknowledge(call)
         feeder = await self._feeder_of(request, route, body)
-        if feeder is None:
+        # Outside of the caller's scope the front refuses the request as its own.
+        if feeder is None or not identity.sees(feeder):
             return None
         self._permit(route, feeder)
         limit_s = DESIGN_S if route == f"PUT {_FEEDER}" else ANSWER_S
@@ -265,7 +270,10 @@ class Forwarder:
         return await to_thread.run_sync(self._subject, path, given, body)
 
     def _subject(self, path: str, given: Mapping[str, Any], body: bytes) -> str | None:
-        """Feeder of what a command changes; None if it does not exist: the front refuses the command."""
+        """Feeder of what a command changes; None if it does not exist or its id is not valid.
+
+        The front refuses the command then.
+        """
         finders: Mapping[str, Callable[[str], Any]] = {
             "alarm": self._store.alarm,
             "incident": self._store.incident,
@@ -274,15 +282,13 @@ class Forwarder:
         }
         for name, find in finders.items():
             if f"{name}_id" in given:
-                found = find(given[f"{name}_id"])
-                return None if found is None else str(found.feeder)
+                return _feeder_of(find, given[f"{name}_id"])
         if path not in {"/api/v1/shelves", "/api/v1/planned-work"}:
             return None
         wanted = _object(body)
         for name in ("alarm", "incident"):
             if isinstance(number := wanted.get(name), str):
-                found = finders[name](number)
-                return None if found is None else str(found.feeder)
+                return _feeder_of(finders[name], number)
         feeder = wanted.get("feeder")
         return feeder if isinstance(feeder, str) and feeder in self._names() else None
 
@@ -294,9 +300,9 @@ class Forwarder:
         """
         wanted = _object(call.body)
         names = wanted.get("alarms")
-        if not isinstance(names, list) or not all(isinstance(one, str) for one in names):
+        if not isinstance(names, list) or not 1 <= len(names) <= BULK_MOST or not all(map(_is_id, names)):
             return None
-        parts = await to_thread.run_sync(self._by_owner, names)
+        parts = await to_thread.run_sync(self._by_owner, names, call.identity)
         found: list[Any] = []
         for feeder, part in parts.items():
             body = json.dumps({**wanted, "alarms": part}).encode()
@@ -309,11 +315,11 @@ class Forwarder:
         found.sort(key=lambda alarm: order[alarm["id"]])
         return Response(json.dumps(found), media_type="application/json")
 
-    def _by_owner(self, names: Sequence[str]) -> dict[str, list[str]]:
-        """Alarms by a feeder of each owner. Raises AlarmUnknown, NoOwner."""
+    def _by_owner(self, names: Sequence[str], caller: Identity) -> dict[str, list[str]]:
+        """Alarms by a feeder of each owner. Raises AlarmUnknown outside of the caller's scope, NoOwner."""
         feeders: dict[str, str] = {}
         for name in names:
-            if (alarm := self._store.alarm(name)) is None:
+            if (alarm := self._store.alarm(name)) is None or not caller.sees(alarm.feeder):
                 raise AlarmUnknown(name)
             feeders[name] = alarm.feeder
         parts: dict[str, tuple[str, list[str]]] = {}
@@ -327,6 +333,17 @@ class Forwarder:
 def get(path: str, query: str = "") -> Call:
     """A request of the front itself."""
     return Call("GET", path, query, (("accept", "application/json"),), b"", OPEN)
+
+
+def _is_id(value: object) -> bool:
+    """True for the id of an alarm, an incident, a shelf or a planned work."""
+    return isinstance(value, str) and _ID.fullmatch(value) is not None
+
+
+def _feeder_of(find: Callable[[str], Any], number: str) -> str | None:
+    """Feeder of an object with an id; None without one."""
+    found = find(number) if _is_id(number) else None
+    return None if found is None else str(found.feeder)
 
 
 def _object(body: bytes) -> dict[str, Any]:
