@@ -187,7 +187,11 @@ class Forwarder:
             return None
         self._permit(route, feeder)
         limit_s = DESIGN_S if route == f"PUT {_FEEDER}" else ANSWER_S
-        return _response(await self.ask(feeder, call, limit_s))
+        answer = await self.ask(feeder, call, limit_s)
+        if answer.status == 404 and feeder in self._names() and self._workers.entry(feeder) is None:
+            # Its owner has the lease, and has not taken it over yet.
+            raise NoOwner(feeder)
+        return _response(answer)
 
     def _permit(self, route: str, feeder: str) -> None:
         """Check the rules for the whole fleet."""
