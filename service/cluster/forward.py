@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import re
 import threading
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
+from weakref import WeakValueDictionary
 
 import structlog
 from anyio import CapacityLimiter, to_thread
@@ -37,7 +39,7 @@ from service.cluster.messages import (
     WorkerState,
     rest_key,
 )
-from service.errors import FeederFixed, NoOwner, TooManyFeeders
+from service.errors import FeederFixed, NoOwner, TooManyFeeders, WorkerBusy
 from service.ingest.queues import BusUnavailable
 from service.store import OutcomeUnknown
 from service.store.leases import shard_of
@@ -124,7 +126,9 @@ DESIGN_S: Final = 600.0
 WATCH_S: Final = 0.1
 """Interval at which the owner is compared while an answer is under way, s."""
 FORWARDS: Final = 64
-"""Largest number of requests that wait for workers at a time."""
+"""Largest number of requests that wait for one worker at a time."""
+SLOT_S: Final = 5.0
+"""Time limit of the wait of a further request, s."""
 BULK_MOST: Final = 1000
 """Largest number of alarms of one acknowledgement."""
 _ID: Final = re.compile(r"[0-9A-Z]{26}")
@@ -161,14 +165,16 @@ class Forwarder:
         self._workers, self._store, self._ask, self._envelope = workers, store, ask, envelope
         self._refresh = refresh
         self._given, self._names, self._max_feeders = given, names, max_feeders
-        self._threads = CapacityLimiter(FORWARDS)
+        # The slots of each worker limit the threads.
+        self._threads = CapacityLimiter(math.inf)
+        self._slots: WeakValueDictionary[str, asyncio.Semaphore] = WeakValueDictionary()
 
     async def __call__(
         self, request: Request, identity: Identity, route: str, body: bytes
     ) -> Response | None:
         """Response of the owner; None if the front answers by itself.
 
-        Raises NoOwner, OutcomeUnknown, FeederFixed, TooManyFeeders.
+        Raises NoOwner, WorkerBusy, OutcomeUnknown, FeederFixed, TooManyFeeders.
         """
         found = await self._forwarded(request, identity, route, body)
         if found is not None and request.method not in {"GET", "HEAD"}:
@@ -210,7 +216,7 @@ class Forwarder:
     async def ask(self, feeder: str, call: Call, limit_s: float = ANSWER_S) -> Answer:
         """Answer of a feeder's owner; a read is repeated after a change of the owner.
 
-        Raises NoOwner, OutcomeUnknown.
+        Raises NoOwner, WorkerBusy, OutcomeUnknown.
         """
         reads = call.method == "GET"
         while True:
@@ -238,10 +244,18 @@ class Forwarder:
         return None if found is None else (found[0].worker, found[1])
 
     async def ask_worker(self, worker: str, call: Call, limit_s: float = ANSWER_S) -> Answer | None:
-        """Answer of a worker; None without one."""
-        return await to_thread.run_sync(
-            self.ask_blocking, worker, call, limit_s, abandon_on_cancel=True, limiter=self._threads
-        )
+        """Answer of a worker; None without one. Raises WorkerBusy if too many requests wait for it."""
+        slots = self._slots.setdefault(worker, asyncio.Semaphore(FORWARDS))
+        try:
+            await asyncio.wait_for(slots.acquire(), SLOT_S)
+        except TimeoutError as error:
+            raise WorkerBusy(worker, FORWARDS) from error
+        try:
+            return await to_thread.run_sync(
+                self.ask_blocking, worker, call, limit_s, abandon_on_cancel=True, limiter=self._threads
+            )
+        finally:
+            slots.release()
 
     def ask_blocking(self, worker: str, call: Call, limit_s: float) -> Answer | None:
         """Answer of a worker; None without one. Blocks."""

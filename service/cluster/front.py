@@ -29,7 +29,7 @@ from service.cluster.forward import DESIGN_S, Forwarder, Workers, get
 from service.cluster.messages import Call
 from service.engine.commissioning import CommissioningProgress
 from service.engine.operators import Operators
-from service.errors import FeederUnknown, NoOwner
+from service.errors import FeederUnknown, NoOwner, WorkerBusy
 from service.metrics import Metrics
 from service.report.feeder_info import Ownership
 from service.report.report import FeederReport
@@ -226,7 +226,7 @@ class Front:
         try:
             call = Call("PUT", f"/api/v1/feeders/{name}", "", headers, body, OPEN)
             answer = await self._forwarder.ask(name, call, DESIGN_S)
-        except (NoOwner, StoreUnavailable):
+        except (NoOwner, WorkerBusy, StoreUnavailable):
             return None
         if 400 <= answer.status < 500:
             detail = json.loads(answer.body or b"{}").get("detail")

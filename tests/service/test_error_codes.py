@@ -58,7 +58,7 @@ from service.engine.commissioning import FeederCommissioning
 from service.engine.design_jobs import prepare
 from service.engine.operators import Operators, ShelfRequest
 from service.engine.runtime import Runtime
-from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, NoOwner, TooManyFeeders
+from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, NoOwner, TooManyFeeders, WorkerBusy
 from service.ingest import zenoh_bus
 from service.ingest.align import AlignRules
 from service.ingest.queues import BusConfig
@@ -569,6 +569,7 @@ CALLS: dict[str, Call] = {
         FeederNotLoaded("village", "meters.csv: missing")
     ),
     "feeder without a worker": lambda _, __: refuse(NoOwner("village")),
+    "busy worker": lambda _, __: refuse(WorkerBusy("w0", 64)),
     "message of another cluster": lambda _, __: Envelope(b"ours").open(
         "call", Envelope(b"theirs").seal("call", {})
     ),

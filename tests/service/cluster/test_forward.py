@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import json
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,9 +16,10 @@ from starlette.responses import Response
 
 from service.access.identity import Identity, Role
 from service.alarms.state_machine import AlarmUnknown
-from service.cluster.forward import Forwarder, Workers
-from service.cluster.messages import Envelope
-from service.errors import NoOwner
+from service.cluster import forward as module
+from service.cluster.forward import Forwarder, Workers, get
+from service.cluster.messages import Envelope, rest_key
+from service.errors import NoOwner, WorkerBusy
 from service.store import Store
 from service.store.store import Reader
 from tests.codes import refused
@@ -86,3 +89,31 @@ def test_a_missing_owner_is_told_within_the_scope_only(store: Store) -> None:
     assert on_alarm(made, ALARM.id, EVE) is None
     with refused(AlarmUnknown, "unknown-alarm"):
         forwarded(made, "POST", BULK, EVE, body=bulk)
+
+
+def test_a_busy_worker_does_not_block_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "FORWARDS", 1)
+    monkeypatch.setattr(module, "SLOT_S", 0.05)
+    ended = threading.Event()
+
+    def ask(key: str, _message: bytes, _limit_s: float) -> list[bytes]:
+        if key == rest_key("slow"):
+            ended.wait(5.0)
+        return []
+
+    envelope = Envelope(b"secret")
+    made = Forwarder(Workers(envelope), object.__new__(Reader), ask, envelope, names=dict, refresh=nothing)
+
+    async def run() -> None:
+        slow = asyncio.create_task(made.ask_worker("slow", get("/healthz")))
+        await asyncio.sleep(0)
+        with refused(WorkerBusy, "worker-busy"):
+            await made.ask_worker("slow", get("/healthz"))
+        assert await made.ask_worker("fast", get("/healthz")) is None
+        ended.set()
+        assert await slow is None
+        assert await made.ask_worker("slow", get("/healthz")) is None
+
+    asyncio.run(run())
+    gc.collect()  # cycles of the error
+    assert dict(made._slots) == {}
