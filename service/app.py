@@ -199,7 +199,9 @@ class HttpSide:
         stopping: Callable[[], None],
     ) -> None:
         """Run the service and its HTTP application until a signal or `Running.stop`."""
-        notifier = _notifier(stack, self.settings, self.targets, service, wall=self.wall)
+        # Several fronts may run; one of them sends.
+        shared = forward is not None
+        notifier = _notifier(stack, self.settings, self.targets, service, shared=shared, wall=self.wall)
         api = create_api(
             service,
             self.settings.http_hosts,
@@ -249,12 +251,13 @@ def _notifier(
     targets: Targets | None,
     service: Served,
     *,
+    shared: bool,
     wall: Callable[[], float],
 ) -> Notifier | None:
     """Notifier of the targets, ended with the stack; None without targets."""
     if targets is None:
         return None
-    deliveries = stack.enter_context(DeliveryStore(settings.database))
+    deliveries = stack.enter_context(DeliveryStore(settings.database, shared=shared))
     notifier = Notifier(targets, IncidentSource(service.store), deliveries, service.counters, wall)
     stack.callback(notifier.close)
     return notifier

@@ -66,3 +66,12 @@ class NoOwner(GridsecError):
 
     def __init__(self, feeder: str) -> None:
         super().__init__(f"no worker monitors feeder {feeder!r} at the moment; another one takes it over")
+
+
+class WorkerBusy(GridsecError):
+    """Too many requests wait for the worker; this one has not been sent."""
+
+    code = "worker-busy"
+
+    def __init__(self, worker: str, most: int) -> None:
+        super().__init__(f"{most} requests wait for worker {worker!r}; this one is not executed")

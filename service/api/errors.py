@@ -22,7 +22,15 @@ from service.access.identity import IssuerUnavailable, NotAuthenticated, NotPerm
 from service.alarms.incidents import IncidentChanged, WrongTime
 from service.alarms.state_machine import AlreadyAcknowledged, NotAcknowledged, RaisedAgain
 from service.engine.commissioning import NothingToLearn
-from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, IdUnknown, NoOwner, TooManyFeeders
+from service.errors import (
+    FeederFixed,
+    FeederNotLoaded,
+    FeederUnknown,
+    IdUnknown,
+    NoOwner,
+    TooManyFeeders,
+    WorkerBusy,
+)
 from service.store import OutcomeUnknown, StoreUnavailable
 
 _log = structlog.get_logger("gridsec.http")
@@ -223,6 +231,7 @@ _STATUS: dict[type[GridsecError], int] = {
     TooManyFailures: 429,
     FeederNotLoaded: 503,
     NoOwner: 503,
+    WorkerBusy: 503,
     StoreUnavailable: 503,
     GridsecError: 500,
 }
@@ -237,7 +246,7 @@ def handlers() -> dict[type[Exception], Handler]:
 def _gridsec_handler(status: int) -> Handler:
     async def handler(request: Request, error: Exception) -> Response:
         more: dict[str, Any] = {}
-        if isinstance(error, NoOwner):
+        if isinstance(error, NoOwner | WorkerBusy):
             more["code"] = error.code
         if isinstance(error, FeederInvalid):
             more["problems"] = list(error.problems)

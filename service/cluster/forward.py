@@ -11,11 +11,14 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
+import re
 import threading
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
+from weakref import WeakValueDictionary
 
 import structlog
 from anyio import CapacityLimiter, to_thread
@@ -36,7 +39,7 @@ from service.cluster.messages import (
     WorkerState,
     rest_key,
 )
-from service.errors import FeederFixed, NoOwner, TooManyFeeders
+from service.errors import FeederFixed, NoOwner, TooManyFeeders, WorkerBusy
 from service.ingest.queues import BusUnavailable
 from service.store import OutcomeUnknown
 from service.store.leases import shard_of
@@ -123,7 +126,12 @@ DESIGN_S: Final = 600.0
 WATCH_S: Final = 0.1
 """Interval at which the owner is compared while an answer is under way, s."""
 FORWARDS: Final = 64
-"""Largest number of requests that wait for workers at a time."""
+"""Largest number of requests that wait for one worker at a time."""
+SLOT_S: Final = 5.0
+"""Time limit of the wait of a further request, s."""
+BULK_MOST: Final = 1000
+"""Largest number of alarms of one acknowledgement."""
+_ID: Final = re.compile(r"[0-9A-Z]{26}")
 _BULK: Final = "POST /api/v1/alarms/ack"
 _FEEDER: Final = "/api/v1/feeders/{feeder}"
 
@@ -138,7 +146,7 @@ class Forwarder:
     store: database, to find the feeder of an alarm.
     given: feeders of the command line, which REST cannot delete.
     names: names of all feeders.
-    refresh: reads them again, after one was put or deleted.
+    refresh: reads the feeders and events of the database, after each command.
     max_feeders: largest number of feeders added over REST.
     """
 
@@ -157,26 +165,38 @@ class Forwarder:
         self._workers, self._store, self._ask, self._envelope = workers, store, ask, envelope
         self._refresh = refresh
         self._given, self._names, self._max_feeders = given, names, max_feeders
-        self._threads = CapacityLimiter(FORWARDS)
+        # The slots of each worker limit the threads.
+        self._threads = CapacityLimiter(math.inf)
+        self._slots: WeakValueDictionary[str, asyncio.Semaphore] = WeakValueDictionary()
 
     async def __call__(
         self, request: Request, identity: Identity, route: str, body: bytes
     ) -> Response | None:
         """Response of the owner; None if the front answers by itself.
 
-        Raises NoOwner, OutcomeUnknown, FeederFixed, TooManyFeeders.
+        Raises NoOwner, WorkerBusy, OutcomeUnknown, FeederFixed, TooManyFeeders.
         """
+        found = await self._forwarded(request, identity, route, body)
+        if found is not None and request.method not in {"GET", "HEAD"}:
+            await self._refresh()
+        return found
+
+    async def _forwarded(
+        self, request: Request, identity: Identity, route: str, body: bytes
+    ) -> Response | None:
         call = self._call(request, identity, body)
         if route == _BULK:
             return await self._acknowledge(call)
         feeder = await self._feeder_of(request, route, body)
-        if feeder is None:
+        # Outside of the caller's scope the front refuses the request as its own.
+        if feeder is None or not identity.sees(feeder):
             return None
         self._permit(route, feeder)
         limit_s = DESIGN_S if route == f"PUT {_FEEDER}" else ANSWER_S
         answer = await self.ask(feeder, call, limit_s)
-        if route in {f"PUT {_FEEDER}", f"DELETE {_FEEDER}"}:
-            await self._refresh()
+        if answer.status == 404 and feeder in self._names() and self._workers.entry(feeder) is None:
+            # Its owner has the lease, and has not taken it over yet.
+            raise NoOwner(feeder)
         return _response(answer)
 
     def _permit(self, route: str, feeder: str) -> None:
@@ -196,7 +216,7 @@ class Forwarder:
     async def ask(self, feeder: str, call: Call, limit_s: float = ANSWER_S) -> Answer:
         """Answer of a feeder's owner; a read is repeated after a change of the owner.
 
-        Raises NoOwner, OutcomeUnknown.
+        Raises NoOwner, WorkerBusy, OutcomeUnknown.
         """
         reads = call.method == "GET"
         while True:
@@ -224,10 +244,18 @@ class Forwarder:
         return None if found is None else (found[0].worker, found[1])
 
     async def ask_worker(self, worker: str, call: Call, limit_s: float = ANSWER_S) -> Answer | None:
-        """Answer of a worker; None without one."""
-        return await to_thread.run_sync(
-            self.ask_blocking, worker, call, limit_s, abandon_on_cancel=True, limiter=self._threads
-        )
+        """Answer of a worker; None without one. Raises WorkerBusy if too many requests wait for it."""
+        slots = self._slots.setdefault(worker, asyncio.Semaphore(FORWARDS))
+        try:
+            await asyncio.wait_for(slots.acquire(), SLOT_S)
+        except TimeoutError as error:
+            raise WorkerBusy(worker, FORWARDS) from error
+        try:
+            return await to_thread.run_sync(
+                self.ask_blocking, worker, call, limit_s, abandon_on_cancel=True, limiter=self._threads
+            )
+        finally:
+            slots.release()
 
     def ask_blocking(self, worker: str, call: Call, limit_s: float) -> Answer | None:
         """Answer of a worker; None without one. Blocks."""
@@ -260,7 +288,10 @@ class Forwarder:
         return await to_thread.run_sync(self._subject, path, given, body)
 
     def _subject(self, path: str, given: Mapping[str, Any], body: bytes) -> str | None:
-        """Feeder of what a command changes; None if it does not exist: the front refuses the command."""
+        """Feeder of what a command changes; None if it does not exist or its id is not valid.
+
+        The front refuses the command then.
+        """
         finders: Mapping[str, Callable[[str], Any]] = {
             "alarm": self._store.alarm,
             "incident": self._store.incident,
@@ -269,15 +300,13 @@ class Forwarder:
         }
         for name, find in finders.items():
             if f"{name}_id" in given:
-                found = find(given[f"{name}_id"])
-                return None if found is None else str(found.feeder)
+                return _feeder_of(find, given[f"{name}_id"])
         if path not in {"/api/v1/shelves", "/api/v1/planned-work"}:
             return None
         wanted = _object(body)
         for name in ("alarm", "incident"):
             if isinstance(number := wanted.get(name), str):
-                found = finders[name](number)
-                return None if found is None else str(found.feeder)
+                return _feeder_of(finders[name], number)
         feeder = wanted.get("feeder")
         return feeder if isinstance(feeder, str) and feeder in self._names() else None
 
@@ -289,9 +318,9 @@ class Forwarder:
         """
         wanted = _object(call.body)
         names = wanted.get("alarms")
-        if not isinstance(names, list) or not all(isinstance(one, str) for one in names):
+        if not isinstance(names, list) or not 1 <= len(names) <= BULK_MOST or not all(map(_is_id, names)):
             return None
-        parts = await to_thread.run_sync(self._by_owner, names)
+        parts = await to_thread.run_sync(self._by_owner, names, call.identity)
         found: list[Any] = []
         for feeder, part in parts.items():
             body = json.dumps({**wanted, "alarms": part}).encode()
@@ -304,11 +333,11 @@ class Forwarder:
         found.sort(key=lambda alarm: order[alarm["id"]])
         return Response(json.dumps(found), media_type="application/json")
 
-    def _by_owner(self, names: Sequence[str]) -> dict[str, list[str]]:
-        """Alarms by a feeder of each owner. Raises AlarmUnknown, NoOwner."""
+    def _by_owner(self, names: Sequence[str], caller: Identity) -> dict[str, list[str]]:
+        """Alarms by a feeder of each owner. Raises AlarmUnknown outside of the caller's scope, NoOwner."""
         feeders: dict[str, str] = {}
         for name in names:
-            if (alarm := self._store.alarm(name)) is None:
+            if (alarm := self._store.alarm(name)) is None or not caller.sees(alarm.feeder):
                 raise AlarmUnknown(name)
             feeders[name] = alarm.feeder
         parts: dict[str, tuple[str, list[str]]] = {}
@@ -322,6 +351,17 @@ class Forwarder:
 def get(path: str, query: str = "") -> Call:
     """A request of the front itself."""
     return Call("GET", path, query, (("accept", "application/json"),), b"", OPEN)
+
+
+def _is_id(value: object) -> bool:
+    """True for the id of an alarm, an incident, a shelf or a planned work."""
+    return isinstance(value, str) and _ID.fullmatch(value) is not None
+
+
+def _feeder_of(find: Callable[[str], Any], number: str) -> str | None:
+    """Feeder of an object with an id; None without one."""
+    found = find(number) if _is_id(number) else None
+    return None if found is None else str(found.feeder)
 
 
 def _object(body: bytes) -> dict[str, Any]:

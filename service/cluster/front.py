@@ -25,15 +25,16 @@ from gridsec.interface import Cause, Decision
 from service.access.identity import OPEN
 from service.alarms.state_machine import Alarm, AlarmUnknown
 from service.cluster.catalogue import Catalogue
-from service.cluster.forward import Forwarder, Workers, get
+from service.cluster.forward import DESIGN_S, Forwarder, Workers, get
 from service.cluster.messages import Call
 from service.engine.commissioning import CommissioningProgress
 from service.engine.operators import Operators
-from service.errors import FeederUnknown, NoOwner
+from service.errors import FeederUnknown, NoOwner, WorkerBusy
 from service.metrics import Metrics
 from service.report.feeder_info import Ownership
 from service.report.report import FeederReport
 from service.store import Store, StoreUnavailable
+from service.store.incidents import suppression_mark
 
 _SAMPLE = re.compile(rb"^([A-Za-z_:][A-Za-z0-9_:]*)(?:\{(.*)\})? (.+)$")
 """A sample: name, labels, value with an optional time."""
@@ -88,6 +89,17 @@ _log = structlog.get_logger("gridsec.cluster")
 class ObservedStore(Store):
     """Database of a front, which writes nothing."""
 
+    _mark: tuple[tuple[float, ...], ...] = ()
+
+    def refresh(self) -> None:
+        """Read the newest events, and count changes of shelves and planned works."""
+        super().refresh()
+        with self._read() as connection:
+            mark = suppression_mark(connection)
+        if mark != self._mark:
+            self._mark = mark
+            self._suppression_changes += 1
+
     def check(self) -> None:
         """Test a read. Raises StoreUnavailable if the database does not answer."""
         self.refresh()
@@ -125,6 +137,7 @@ class Front:
         self._missing = set(given)
         self._problem: str | None = None
         self._registered: list[str] = []
+        self._newest = (store.last_event, store.last_incident_event)
         self._read = asyncio.Event()
         self._subscribers: set[asyncio.Queue[str]] = set()
         self._stopping = asyncio.Event()
@@ -166,16 +179,21 @@ class Front:
     async def _follow(self) -> None:
         """Read the numbers of the newest events, and wake streams after a change."""
         while True:
-            before = (self.store.last_event, self.store.last_incident_event)
             with contextlib.suppress(StoreUnavailable):  # `refresh` reports it
-                await asyncio.to_thread(self.store.refresh)
-            if before != (self.store.last_event, self.store.last_incident_event):
-                self._notify("alarm")
+                await self._read_events()
             await asyncio.sleep(POLL_S)
 
+    async def _read_events(self) -> None:
+        await asyncio.to_thread(self.store.refresh)
+        newest = (self.store.last_event, self.store.last_incident_event)
+        if newest != self._newest:
+            self._newest = newest
+            self._notify("alarm")
+
     async def refresh(self) -> None:
-        """Read the feeders of the database."""
+        """Read the feeders and the newest events of the database."""
         try:
+            await self._read_events()
             changes = await asyncio.to_thread(self._catalogue.refresh)
             self._registered = await asyncio.to_thread(self._live_workers)
         except StoreUnavailable as error:
@@ -193,26 +211,28 @@ class Front:
             tables = json.loads(json.dumps(to_json(site.tables)))
             while True:
                 listed = self._catalogue.feeders.get(name)
-                if listed is not None and listed.tables == tables:
-                    break
-                if await self._put(name, tables):
-                    break
-                await asyncio.sleep(PUT_AGAIN_S)
-            self._missing.discard(name)
+                stored = listed is not None and listed.tables == tables
+                if not stored and (stored := await self._put(name, tables)) is None:
+                    await asyncio.sleep(PUT_AGAIN_S)
+                    continue
+                if stored:
+                    self._missing.discard(name)
+                break
 
-    async def _put(self, name: str, tables: Mapping[str, Any]) -> bool:
+    async def _put(self, name: str, tables: Mapping[str, Any]) -> bool | None:
+        """True if the owner has stored the tables, False if it refuses them, None without an outcome."""
         body = json.dumps(tables).encode()
         headers = (("content-type", "application/json"), ("accept", "application/json"))
         try:
-            answer = await self._forwarder.ask(
-                name, Call("PUT", f"/api/v1/feeders/{name}", "", headers, body, OPEN)
-            )
-        except (NoOwner, StoreUnavailable):
-            return False
+            call = Call("PUT", f"/api/v1/feeders/{name}", "", headers, body, OPEN)
+            answer = await self._forwarder.ask(name, call, DESIGN_S)
+        except (NoOwner, WorkerBusy, StoreUnavailable):
+            return None
         if 400 <= answer.status < 500:
             detail = json.loads(answer.body or b"{}").get("detail")
             _log.error("a feeder of the command line is refused", feeder=name, problem=detail)
-        return answer.status == 200
+            return False
+        return True if answer.status == 200 else None
 
     def stop(self) -> None:
         """End `run` and every subscription soon; called from the event loop."""

@@ -27,6 +27,8 @@ from service.cluster.forward import Forwarder, Workers
 from service.cluster.front import Front, ObservedStore
 from service.cluster.messages import STATES, Envelope
 from service.ingest.align import Clock
+from service.ingest.queues import BusConfig
+from service.ingest.zenoh_bus import fixed_listeners
 from service.settings import ENV_PREFIX, Settings, SettingsInvalid
 from service.store.cluster_secret import cluster_secret
 from service.store.committer import missed
@@ -156,7 +158,7 @@ OBSERVER: Final = "front"
 
 
 def check_cluster(settings: Settings) -> None:
-    """Refuse settings that several processes cannot have. Raises SettingsInvalid."""
+    """Refuse settings that several processes cannot have. Raises SettingsInvalid, BusUnavailable."""
     problems = []
     if not settings.database.startswith("postgresql"):
         text = (
@@ -167,6 +169,14 @@ def check_cluster(settings: Settings) -> None:
     if settings.clock is Clock.EVENTS:
         text = f"--clock or {ENV_PREFIX}CLOCK: workers need the clock `wall`"
         problems.append(Problem("needs-wall-clock", text))
+    if settings.workers and settings.zenoh_config is not None:
+        own = BusConfig(settings.zenoh_mode, (), settings.zenoh_connect, settings.zenoh_config)
+        if ends := fixed_listeners(own):
+            text = (
+                f"--zenoh-config or {ENV_PREFIX}ZENOH_CONFIG: local workers would listen on "
+                f"{', '.join(ends)} as well; expected a file that connects to a router, or --workers 0"
+            )
+            problems.append(Problem("shared-endpoint", text))
     if problems:
         raise SettingsInvalid(problems)
 

@@ -167,10 +167,12 @@ class Member:
                 balance_at = time.monotonic() + BALANCE_S
             await asyncio.sleep(POLL_S)
 
-    def _refresh(self) -> None:
+    def _refresh(self) -> bool:
+        """Read the feeders of the database; True after success."""
         self._catalogue.refresh()
         # The time of a tick grows with the meters.
         self._leases.weigh({name: 1.0 + len(one.meters) for name, one in self._catalogue.feeders.items()})
+        return True
 
     def _wanted(self) -> set[str]:
         held = self._leases.held
@@ -179,7 +181,9 @@ class Member:
     async def _reconcile(self, host: Host, readings: Readings) -> None:
         """Monitor exactly the feeders of the held shards."""
         wanted = self._wanted()
-        gone, new = self._ours - wanted, wanted - self._ours - self._unloaded.keys()
+        # A command that ends after the release of its shard leaves a monitor without a lease.
+        monitored = {name for name in self._catalogue.feeders if host.known(name)}
+        gone, new = (self._ours | monitored) - wanted, wanted - self._ours - self._unloaded.keys()
         for name in gone:
             readings.unfollow(name)
         self._ours -= gone
@@ -197,6 +201,9 @@ class Member:
 
     async def _adopt(self, host: Host, readings: Readings, names: Collection[str]) -> None:
         began = time.monotonic()
+        # An earlier owner may have stored newer tables before the claim.
+        if not await self._asked("read the feeders of", self._refresh):
+            return
         found = await asyncio.to_thread(self._catalogue.sites, names)
         self._unloaded |= {name: one for name, one in found.items() if isinstance(one, str)}
         sites = [one for one in found.values() if isinstance(one, Site)]
@@ -297,7 +304,11 @@ async def work(
         store = stack.enter_context(Store(settings.database, leases=leases))
         member = Member(leases, Catalogue(store))
         config = replace(
-            runtime_config(settings), max_feeders=NO_LIMIT, ownership=member.ownership, acts=member.acts
+            runtime_config(settings),
+            max_feeders=NO_LIMIT,
+            ownership=member.ownership,
+            rejects_unknown=False,
+            acts=member.acts,
         )
         runtime = Runtime(config, store, (), given=(), wall=wall, settled=settled)
         bus = bus_of(settings, shares, runtime.deliver, missed=None, wall=wall, everything=False)

@@ -201,6 +201,8 @@ class RuntimeConfig:
     meter_keys: MeterKeys | None = None  # keys of meters; None accepts readings without signature
     # Worker and lease of a feeder; None without workers.
     ownership: Callable[[str], Ownership | None] = lambda _: None
+    # False: readings of feeders that are not monitored are discarded; some arrive at each hand-over.
+    rejects_unknown: bool = True
     # False while the leases of this process may have expired: it must not act.
     acts: Callable[[], bool] = lambda: True
 
@@ -394,14 +396,17 @@ class Engine:
     ) -> Future[list[FeederMonitor]]:
         """Go on with feeders of another owner: their state and standing alarms.
 
-        `installed` is called with each monitor. Raises StoreUnavailable if the database cannot be read; no
-        feeder is taken over then.
+        A feeder that is monitored by then keeps its monitor: its tables are the same or newer. `installed`
+        is called with each new monitor. Raises StoreUnavailable if the database cannot be read; no feeder is
+        taken over then.
         """
         answer: Future[list[FeederMonitor]] = Future()
 
         def take(found: Sequence[Handover]) -> None:
             made = []
             for site, handover in zip(sites, found, strict=True):
+                if site.feeder.name in self.monitors:
+                    continue
                 made.append(self.add(site, handover.state))
                 self._take_over(handover)
                 installed(made[-1])
@@ -580,12 +585,15 @@ class Engine:
             if not self._continues():
                 break
             gathered = self._wire.gather(samples[begin : begin + SAMPLES_AT_ONCE])
-            bad.extend(self._note(problem, sample) for problem, sample in gathered.bad)
+            bad.extend(self._note(*one) for one in gathered.bad if self._rejects(one[0]))
             self._refuse_identities(problem for problem, _ in gathered.bad)
             for name, readings in gathered.readings.items():
                 bad.extend(self._align(self.monitors[name], readings))
         # Rejected readings are stored in the order of their arrival.
         return sorted(bad, key=lambda one: one.t)
+
+    def _rejects(self, problem: BadReading) -> bool:
+        return self.config.rejects_unknown or problem.reason is not BadReason.UNKNOWN_FEEDER
 
     def _align(self, monitor: FeederMonitor, readings: Readings) -> Iterable[Rejected]:
         """Align the readings of a feeder; yield those with a wrong clock."""

@@ -9,6 +9,7 @@ from a callback can deadlock. Every session is closed explicitly, otherwise the 
 from __future__ import annotations
 
 import json
+import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -120,17 +121,36 @@ def endpoints(config: BusConfig) -> tuple[str, ...]:
         If the configuration is wrong.
     """
     built = _config(config)
-    mode = json.loads(built.get_json("mode")) or "peer"
-    found: list[str] = []
-    for name in ("listen", "connect"):
-        ends = json.loads(built.get_json(f"{name}/endpoints"))
-        if isinstance(ends, dict):
-            ends = ends.get(mode, [])
-        found += [end["locator"] if isinstance(end, dict) else end for end in ends or ()]
+    mode = _mode(built)
+    found = [*_ends(built, "listen"), *_ends(built, "connect")]
     scouts = mode != "router" and json.loads(built.get_json("scouting/multicast/enabled")) is not False
     if scouts and json.loads(built.get_json("transport/link/protocols")) != ["tls"]:
         found.append(_MULTICAST)
     return tuple(found)
+
+
+def fixed_listeners(config: BusConfig) -> tuple[str, ...]:
+    """Return the endpoints that one process of a machine can listen on: all except those with port 0.
+
+    Raises
+    ------
+    BusUnavailable
+        If the configuration is wrong.
+    """
+    ends = _ends(_config(config), "listen")
+    return tuple(end for end in ends if not re.split("[?#]", end, maxsplit=1)[0].endswith(":0"))
+
+
+def _mode(built: zenoh.Config) -> str:
+    return json.loads(built.get_json("mode")) or "peer"
+
+
+def _ends(built: zenoh.Config, name: str) -> list[str]:
+    """Endpoints to `listen` or `connect`."""
+    ends = json.loads(built.get_json(f"{name}/endpoints"))
+    if isinstance(ends, dict):
+        ends = ends.get(_mode(built), [])
+    return [end["locator"] if isinstance(end, dict) else end for end in ends or ()]
 
 
 def tls_files(config: BusConfig) -> dict[str, str]:

@@ -94,6 +94,16 @@ def next_due(connection: sa.Connection, mine: Mine) -> float | None:
     return min(_due(connection, mine).values(), default=None)
 
 
+def suppression_mark(connection: sa.Connection) -> tuple[tuple[float, ...], ...]:
+    """Return numbers that differ after each begin, end and addition of a shelf or a planned work."""
+    marks = []
+    for table in (SHELF, WORK):
+        t_next = table.c.t_next
+        query = sa.select(sa.func.count(), sa.func.count(t_next), sa.func.coalesce(sa.func.sum(t_next), 0.0))
+        marks.append(tuple(map(float, connection.execute(query.select_from(table)).one())))
+    return tuple(marks)
+
+
 def orphans(connection: sa.Connection) -> list[AlarmTransition]:
     """Return the active alarms without an incident, of a database of an earlier version."""
     a = ALARM.c

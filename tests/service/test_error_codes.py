@@ -58,7 +58,7 @@ from service.engine.commissioning import FeederCommissioning
 from service.engine.design_jobs import prepare
 from service.engine.operators import Operators, ShelfRequest
 from service.engine.runtime import Runtime
-from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, NoOwner, TooManyFeeders
+from service.errors import FeederFixed, FeederNotLoaded, FeederUnknown, NoOwner, TooManyFeeders, WorkerBusy
 from service.ingest import zenoh_bus
 from service.ingest.align import AlignRules
 from service.ingest.queues import BusConfig
@@ -532,6 +532,12 @@ def many_invalid_keys(made: Authenticator) -> None:
     made.of_credential("gridsec_0_0", "127.0.0.1")
 
 
+def workers_of_router(place: Path) -> None:
+    (place / "router.json5").write_text('{mode: "router", listen: {endpoints: ["tls/127.0.0.1:7447"]}}')
+    given = {"database": "postgresql+psycopg://grid", "workers": 2, "zenoh_config": place / "router.json5"}
+    check_cluster(settings(given))
+
+
 def role_too_low(place: Path) -> None:
     made = authenticator(place)
     text, record = create("Ada", Role.VIEWER, None, T0, None)
@@ -563,10 +569,12 @@ CALLS: dict[str, Call] = {
         FeederNotLoaded("village", "meters.csv: missing")
     ),
     "feeder without a worker": lambda _, __: refuse(NoOwner("village")),
+    "busy worker": lambda _, __: refuse(WorkerBusy("w0", 64)),
     "message of another cluster": lambda _, __: Envelope(b"ours").open(
         "call", Envelope(b"theirs").seal("call", {})
     ),
     "workers without PostgreSQL": lambda _, __: check_cluster(settings({"clock": "events"})),
+    "local workers of a router": lambda place, _: workers_of_router(place),
     "feeder of the command line": lambda _, __: refuse(FeederFixed("village")),
     "invalid API key": lambda place, _: authenticator(place).of_credential("gridsec_0_0", "127.0.0.1"),
     "many invalid API keys": lambda place, _: many_invalid_keys(authenticator(place)),

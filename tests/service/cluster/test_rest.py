@@ -9,11 +9,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import pytest
+from starlette.requests import Request
 
 from service.access.identity import OPEN, Identity, Role
 from service.api.routes import create_api
 from service.cluster.forward import Forwarder, Workers, get
-from service.cluster.messages import STATES, Call, Envelope, RestServer, WorkerState, rest_key
+from service.cluster.messages import STATES, Call, Entry, Envelope, RestServer, WorkerState, rest_key
 from service.errors import NoOwner
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import Bus
@@ -44,11 +45,33 @@ class Pair:
         envelope = Envelope(b"secret")
         worker.serve(self.key, RestServer(create_api(service), self.key, envelope, self.loop))
         self.front, self.envelope = front, envelope
-        workers = Workers(envelope)
+        self.workers = Workers(envelope)
         self.worker = worker
+        self.names: set[str] = set()
         self.forwarder = Forwarder(
-            workers, service.store, front.ask, envelope, names=dict, refresh=self.refresh
+            self.workers,
+            service.store,
+            front.ask,
+            envelope,
+            names=lambda: dict.fromkeys(self.names),
+            refresh=self.refresh,
         )
+
+    def report(self, *feeders: str) -> None:
+        """State of the worker: the leases of `village` and `farm`, and entries of taken-over feeders."""
+        shards = {shard_of(name): 1 for name in ("village", "farm")}
+        entries = {name: Entry({"name": name}, {}) for name in feeders}
+        state = WorkerState("w0", 0.0, shards, entries, 0, None, ())
+        self.workers.take(Envelope(b"secret").seal(STATES, state.content()))
+
+    def status(self, feeder: str) -> int:
+        """Status of a forwarded read of a feeder."""
+        path, route = f"/api/v1/feeders/{feeder}", "GET /api/v1/feeders/{feeder}"
+        scope = {"type": "http", "method": "GET", "path": path, "query_string": b"", "headers": []}
+        request = Request({**scope, "path_params": {"feeder": feeder}})
+        answer = asyncio.run(self.forwarder(request, OPEN, route, b""))
+        assert answer is not None
+        return answer.status_code
 
     async def refresh(self) -> None:
         pass
@@ -112,6 +135,16 @@ def test_without_the_secret_nothing_is_executed_or_believed(pair: Pair) -> None:
     assert first
     # A repetition is not executed.
     assert pair.front.ask(pair.key, message, 5.0) == [b""]
+
+
+def test_a_feeder_is_not_absent_during_its_take_over(pair: Pair) -> None:
+    pair.names = {"village", "farm"}
+    pair.report("village")
+    assert pair.status("village") == 200
+    with refused(NoOwner, "no-owner"):
+        pair.status("farm")
+    pair.names.remove("farm")
+    assert pair.status("farm") == 404
 
 
 def test_a_worker_that_is_gone_gives_no_answer(pair: Pair) -> None:

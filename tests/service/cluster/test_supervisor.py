@@ -7,12 +7,14 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 from service.cluster import run as module
-from service.cluster.run import Supervisor, worker_environment
-from service.settings import Settings, settings
+from service.cluster.run import Supervisor, check_cluster, worker_environment
+from service.settings import Settings, SettingsInvalid, settings
+from tests.codes import refused
 from tests.service.running import until
 
 WAITING = (sys.executable, "-S", "-c", "import sys; sys.stdin.read()")
@@ -80,3 +82,28 @@ def test_workers_have_the_settings_of_their_front(monkeypatch: pytest.MonkeyPatc
     assert (found.database, found.prefix, found.max_skew_s) == (chosen["database"], "grid", 7.5)
     assert (found.zenoh_mode, found.zenoh_connect) == ("client", ("tcp/127.0.0.1:7448",))
     assert (found.http, found.workers, found.zenoh_listen) == ("127.0.0.1:8000", None, ())
+
+
+CONFIGURATIONS = {
+    "router": ('{mode: "router", listen: {endpoints: ["tls/127.0.0.1:7447"]}}', False),
+    "default": ('{mode: "router"}', False),
+    "client": ('{mode: "client", connect: {endpoints: ["tls/127.0.0.1:7447"]}}', True),
+    "peer": ('{mode: "peer"}', True),
+}
+
+
+@pytest.mark.parametrize(("text", "valid"), CONFIGURATIONS.values(), ids=CONFIGURATIONS)
+@pytest.mark.parametrize("workers", [0, 2])
+def test_local_workers_do_not_listen_on_the_endpoints_of_their_front(
+    tmp_path: Path, text: str, valid: bool, workers: int
+) -> None:
+    file = tmp_path / "zenoh.json5"
+    file.write_text(text)
+    chosen = settings(
+        {"database": "postgresql+psycopg://gridsec@/grid", "zenoh_config": file, "workers": workers}
+    )
+    if valid or not workers:
+        check_cluster(chosen)
+        return
+    with refused(SettingsInvalid, "shared-endpoint"):
+        check_cluster(chosen)
