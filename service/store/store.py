@@ -14,6 +14,7 @@ import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
@@ -349,6 +350,7 @@ _PRUNED_AT_ONCE = 5000
 """
 ALONE_S = 5.0
 """Wait of a write for the previous one, s."""
+_NO_LEASES: Mapping[int, Lease] = MappingProxyType({})
 _STEADY_S = 86_400.0
 """Time for which a feeder must have reported before anything is deleted, s."""
 _log = structlog.get_logger("gridsec.store")
@@ -376,7 +378,7 @@ class Store(Reader):
         super().__init__(Connections(url, worker=None if leases is None else leases.number))
         self._leases = leases
         # Leases at the last change of `_due` and of the caches, and at the last take-over.
-        self._known = self._taken = self._held
+        self._known = self._taken = self.held
         self._history_rules = history or HistoryRules()
         self.history_step_s = self._history_rules.step_s
         self._lock = threading.RLock()
@@ -465,8 +467,9 @@ class Store(Reader):
         return self._suppression_changes
 
     @property
-    def _held(self) -> Mapping[int, Lease]:
-        return {} if self._leases is None else self._leases.held
+    def held(self) -> Mapping[int, Lease]:
+        """Leases of this process by shard; another object after each change. Empty without workers."""
+        return _NO_LEASES if self._leases is None else self._leases.held
 
     def mine(self, feeder: str) -> bool:
         """True if this process writes a feeder; without a call to the database."""
@@ -477,8 +480,7 @@ class Store(Reader):
 
         A shelf or a planned work changes, or the leases have changed.
         """
-        moved = self._leases is not None and self._leases.held is not self._known
-        return moved or (self._due is not None and self._due <= now)
+        return self.held is not self._known or (self._due is not None and self._due <= now)
 
     def refresh(self) -> None:
         """Read `last_event` and `last_incident_event`: other processes add events, too."""
@@ -510,7 +512,7 @@ class Store(Reader):
 
     def take_over(self) -> tuple[list[AlarmEvent], list[IncidentEvent]]:
         """Return the unpublished events of the shards that were claimed since the last call."""
-        held = self._held
+        held = self.held
         new = {shard for shard, lease in held.items() if self._taken.get(shard) != lease}
         if not new:
             self._taken = held
@@ -556,14 +558,11 @@ class Store(Reader):
     def _numbering() -> sa.ColumnElement[Any]:
         return sa.func.pg_advisory_xact_lock(_EVENT_LOCK)
 
-    def _adopt(self) -> None:
+    def _forget_others(self) -> None:
         """Forget the feeders of released and lost shards: other workers continue their history."""
-        held = self._held
-        if held is not self._known:
-            for cache in (self._marks, self._rolled, self._since_prune):
-                for feeder in [name for name in cache if not self.mine(name)]:
-                    cache.pop(feeder)
-            self._known = held
+        for cache in (self._marks, self._rolled, self._since_prune):
+            for feeder in [name for name in cache if not self.mine(name)]:
+                cache.pop(feeder)
 
     def commit(
         self,
@@ -602,9 +601,10 @@ class Store(Reader):
         if now is None:
             now = max((item.t for item in transitions), default=-math.inf)
         with self._alone():
-            due_now = self.due(now)
+            held, due_now = self.held, self.due(now)
             grouped = bool(transitions or actions or due_now)
-            self._adopt()
+            if held is not self._known:
+                self._forget_others()
             marks, rolled = dict(self._marks), dict(self._rolled)
             worthy = [report for report in reports if self._worth(marks, report)]
             if not (grouped or worthy or rejected or kept or happened or without or put):
@@ -640,7 +640,8 @@ class Store(Reader):
                     moved = due_now or incidents.suppressions_change(grouping)
                 if moved:
                     following = incidents.next_due(connection, self.mine)
-            self._marks, self._rolled, self._due = marks, rolled, following
+            self._marks, self._rolled = marks, rolled
+            self._known, self._due = held, following
             self._last_incident_event = max(self._last_incident_event, newest)
             self._suppression_changes = suppressions
             self._last_event = max((self._last_event, *numbers))

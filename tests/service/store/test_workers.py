@@ -229,6 +229,28 @@ def test_shelves_end_with_the_owner_of_their_feeder(url: str, join: Join) -> Non
     assert second.store.shelves(standing=True) == []
 
 
+def test_a_failed_commit_does_not_hide_the_shelves_of_new_feeders(url: str, join: Join) -> None:
+    first, second = join("a", "b")
+    (feeder,) = first.feeders()
+    alarm = an_alarm(1, feeder=feeder)
+    shelf = Shelf(
+        "S" * 26, feeder, alarm.id, None, None, None, alarm.severity, "Ada", "", t=T0 + 2, until=T0 + 10
+    )
+    first.store.commit([raised(alarm)], actions=[shelf], now=T0 + 2)
+    second.store.commit(now=T0 + 2)
+    hand_over(url, first, second)
+    with psycopg.connect(url.replace("+psycopg", ""), autocommit=True) as admin:
+        admin.execute("ALTER TABLE shelf RENAME TO away")
+        with refused(StoreUnavailable, "write-failed"):
+            second.store.commit(now=T0 + 3)
+        admin.execute("ALTER TABLE away RENAME TO shelf")
+    assert second.store.due(T0 + 3)
+    second.store.commit(now=T0 + 3)
+    assert not second.store.due(T0 + 3)
+    second.store.commit(now=T0 + 11)
+    assert second.store.shelves(standing=True) == []
+
+
 def test_feeders_over_rest_are_seen_by_all(join: Join) -> None:
     first, second = join("a", "b")
     (feeder,) = first.feeders()
