@@ -406,6 +406,8 @@ class Store(Reader):
         self._last_event = int(newest or 0)
         self._last_incident_event = int(newest_incident or 0)
         self._suppression_changes = 0
+        # Key of the last commit, and the newest event before its first attempt.
+        self._attempt: tuple[int | None, int] = None, self._last_event
         if (beat_s := self._connections.beat_s) is not None:
             threading.Thread(
                 target=self._beat, args=(beat_s,), name="gridsec-store-beat", daemon=True
@@ -614,6 +616,8 @@ class Store(Reader):
             feeders |= {item.feeder for item in happened}
             feeders |= {name for name in (without, put and put[0]) if name is not None}
             newest, following = self._last_incident_event, self._due
+            if key is None or key != self._attempt[0]:
+                self._attempt = key, self._last_event
             suppressions = self._suppression_changes + bool(actions or due_now)
             with self._connections.write_once(key) as (connection, stored):
                 if stored:
@@ -681,7 +685,8 @@ class Store(Reader):
     ) -> tuple[int, ...]:
         """Return the numbers of the events of a commit that was stored before."""
         e, feeders = EVENT.c, {item.alarm.feeder for item in transitions}
-        newer = sa.select(e.seq).where(e.seq > self._last_event, e.feeder.in_(feeders)).order_by(e.seq)
+        # `refresh` may have moved `_last_event` beyond them since.
+        newer = sa.select(e.seq).where(e.seq > self._attempt[1], e.feeder.in_(feeders)).order_by(e.seq)
         return tuple(connection.scalars(newer.limit(len(transitions))))
 
     def _put_events(
