@@ -47,7 +47,7 @@ from service.errors import FeederUnknown
 from service.ingest.align import Clock
 from service.ingest.decode import Wire
 from service.ingest.queues import Inbox, Sample
-from service.ingest.reading import BadReading, BadReason, Reading, Readings, head_of
+from service.ingest.reading import BadReading, BadReason, Known, Reading, Readings, head_of
 from service.metrics import Metrics
 from service.report.feeder_info import Ownership
 from service.report.report import BUSBAR, FeederReport
@@ -295,7 +295,7 @@ class Engine:
             monitor.set_shed(True)
         self.unloaded.pop(name, None)
         self._restore_order(name, past.signed)
-        self._learn()
+        self._learn({**self._wire.known, name: known_of(site)})
         return monitor
 
     def _restore_order(self, name: str, kept: StateSnapshot | None) -> None:
@@ -382,7 +382,7 @@ class Engine:
         self.monitors = {other: kept for other, kept in self.monitors.items() if other != name}
         for table in (self._wakes, self._marks, self.reported, self.load.feeders):
             table.pop(name, None)
-        self._learn()
+        self._learn({other: known for other, known in self._wire.known.items() if other != name})
         self.metrics.forget(name)
         if self.committer.publisher is not None:
             self.committer.publisher.withdraw(f"{name}/estimate")
@@ -451,8 +451,8 @@ class Engine:
         for alarm in monitor.book.active:
             publisher.withdraw(alarm_key(alarm))
 
-    def _learn(self) -> None:
-        known = {name: known_of(monitor.site) for name, monitor in self.monitors.items()}
+    def _learn(self, known: Mapping[str, Known]) -> None:
+        """Decode readings of these feeders from now on."""
         self._wire = Wire(known, self.config.prefix, self.config.max_payload, self.config.meter_keys)
 
     def begin(self, given: Collection[str] = ()) -> None:
