@@ -53,7 +53,7 @@ from service.report.feeder_info import Ownership
 from service.report.report import BUSBAR, FeederReport
 from service.report.tick_state import TickState
 from service.store import Rejected, Store
-from service.store.committer import Committer, Executor, Publisher, Wish, alarm_key, incident_key, inline
+from service.store.committer import Committer, Executor, Wish, alarm_key, incident_key, inline
 from service.store.schema import CommissioningEvent
 from service.store.series import Mark, mark, worth_keeping
 from service.store.state_codec import KeptInvalid, StateSnapshot, decode_signed, encode_signed
@@ -385,7 +385,7 @@ class Engine:
         self._learn({other: known for other, known in self._wire.known.items() if other != name})
         self.metrics.forget(name)
         if self.committer.publisher is not None:
-            self.committer.publisher.withdraw(f"{name}/estimate")
+            self.committer.publisher.withdraw(name)
 
     # ---------------------------------------------------------------- feeders of a worker
 
@@ -437,19 +437,22 @@ class Engine:
         answer: Future[None] = Future()
         leaving = [self.monitors[name] for name in names if name in self.monitors]
         self.keep_states(leaving, at_once=True)
-        landed = _landing(answer, lambda: None)
-        self.committer.look(lambda _: None, lambda _: landed(), partial(_refuse, answer))
+        landed = _landing(answer, partial(self._withdraw, names))
+
+        def refused(error: GridsecError) -> None:
+            self._withdraw(names)
+            _refuse(answer, error)
+
+        self.committer.look(lambda _: None, lambda _: landed(), refused)
         for monitor in leaving:
-            if self.committer.publisher is not None:
-                self._withdraw(self.committer.publisher, monitor)
             self._drop(monitor.name)
         return answer
 
-    @staticmethod
-    def _withdraw(publisher: Publisher, monitor: FeederMonitor) -> None:
-        """Remove the replies to queries for a feeder: its next owner has newer ones."""
-        for alarm in monitor.book.active:
-            publisher.withdraw(alarm_key(alarm))
+    def _withdraw(self, names: Collection[str]) -> None:
+        """Remove the replies to queries for left feeders, also those of their last commit."""
+        for name in names:
+            if self.committer.publisher is not None and name not in self.monitors:
+                self.committer.publisher.withdraw(name)
 
     def _learn(self, known: Mapping[str, Known]) -> None:
         """Decode readings of these feeders from now on."""

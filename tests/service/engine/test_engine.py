@@ -313,7 +313,7 @@ def test_a_deleted_feeder_leaves_cleared_alarms_and_its_history(
         assert {alarm.state for alarm in alarms} == {AlarmState.CLEARED}
         assert store.events(alarms[0].id)[-1].comment == NOT_WATCHED
         assert [(a["state"], last) for a, last in outlet.events[2:]] == [("cleared", True)] * 2
-        assert outlet.withdrawn == [f"{FEEDER}/estimate"]
+        assert outlet.withdrawn == [FEEDER]
         assert store.history(FEEDER)
         assert "gridsec_alarms_active{" not in live.metrics.exposition().decode()
         live.cycle(until(attacked, 15.0)[1][:1])
