@@ -43,6 +43,7 @@ from service.engine.commissioning import CommissioningProgress, FeederCommission
 from service.engine.feeder_monitor import FeederMonitor, Suspicions, TickResult, align_rules, known_of
 from service.engine.load import FeederLoad, LoadControl
 from service.engine.operators import SHELVE_MOST_S, Operators
+from service.engine.orphans import Orphans, Standing, read_standing
 from service.errors import FeederUnknown
 from service.ingest.align import Clock
 from service.ingest.decode import Wire
@@ -264,6 +265,7 @@ class Engine:
         self._wakes: dict[str, float] = {}
         self._until = self._order_kept = -math.inf
         self.load = LoadControl(clock)
+        self._clock, self._orphans = clock, Orphans()
         for site in sites:
             self.add(site)
 
@@ -462,10 +464,13 @@ class Engine:
         """Set the replies for standing alarms; publish the stored alarms of an earlier process.
 
         Alarms of feeders that are neither monitored nor stored any more are cleared here: no monitor does it.
-        `given` are further feeders, which this process monitors later.
+        `given` are further feeders, which this process monitors later. A worker has no feeders yet: `adopt`
+        and `_clear_orphans` follow its claims.
         """
+        if self.store.shared:
+            return
         ours, t = {*self.monitors, *self.unloaded, *self.store.feeders(), *given}, self._wall()
-        standing = [alarm for alarm in self.store.active() if self.store.mine(alarm.feeder)]
+        standing = self.store.active()
         left_out = [alarm for alarm in standing if alarm.feeder not in ours]
         self.committer.waiting.add(transitions=close(left_out, t, NOT_WATCHED))
         if self.committer.publisher is not None:
@@ -473,12 +478,25 @@ class Engine:
                 if alarm.feeder in ours:
                     self.committer.publisher.answer(alarm_key(alarm), msgspec.json.encode(alarm_json(alarm)))
             for event in self.store.open_incident_events():
-                if event.incident.feeder in ours and self.store.mine(event.incident.feeder):
+                if event.incident.feeder in ours:
                     payload = msgspec.json.encode(event_json(event))
                     self.committer.publisher.answer(incident_key(event.incident), payload)
         for name in self.unloaded:
             self.metrics.alarms.labels(name).set(sum(alarm.feeder == name for alarm in standing))
         self.committer.commit()
+
+    def _clear_orphans(self) -> None:
+        """Start a read of the alarms of removed feeders, if one is due after a claim; they are cleared."""
+        committer = self.committer
+        if not self.store.shared or committer.storing or committer.problem is not None:
+            return
+
+        def clear(read: Standing) -> None:
+            left_out = self._orphans.found(read, self.monitors)
+            committer.waiting.add(transitions=close(left_out, self._wall(), NOT_WATCHED))
+
+        if self._orphans.due(self.store.held, self._clock()):
+            committer.look(read_standing, clear, lambda _: None)
 
     # ---------------------------------------------------------------- one round
 
@@ -489,6 +507,7 @@ class Engine:
         there is a new report.
         """
         started, begun = time.perf_counter(), time.thread_time()
+        self._clear_orphans()
         bad = self._place(samples)
         self._keep_order(at_once=False)
         self._reach(self._wall(), oldest())

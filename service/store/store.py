@@ -469,6 +469,11 @@ class Store(Reader):
         return self._suppression_changes
 
     @property
+    def shared(self) -> bool:
+        """True if other workers write beside this process."""
+        return self._leases is not None
+
+    @property
     def held(self) -> Mapping[int, Lease]:
         """Leases of this process by shard; another object after each change. Empty without workers."""
         return _NO_LEASES if self._leases is None else self._leases.held
