@@ -101,7 +101,7 @@ class Nowhere:
     def answer(self, key: str, payload: bytes) -> None:
         """Keep nothing."""
 
-    def withdraw(self, key: str) -> None:
+    def withdraw(self, feeder: str) -> None:
         """Change nothing."""
 
 

@@ -86,23 +86,23 @@ class MeterKeys:
     entries: Mapping[tuple[str, str], _Entry]
     accepts_unlisted: bool = False
     changed: set[str] = field(default_factory=set)
-    _newest: dict[tuple[str, str], tuple[int, int]] = field(default_factory=dict)
+    # By feeder and meter.
+    _newest: dict[str, dict[str, tuple[int, int]]] = field(default_factory=dict)
 
     def orders(self, feeder: str) -> list[SignedOrder]:
         """Return the newest accepted readings of a feeder's meters."""
         return [
-            SignedOrder(meter, self.entries[name, meter].digest, *newest)
-            for (name, meter), newest in self._newest.items()
-            if name == feeder
+            SignedOrder(meter, self.entries[feeder, meter].digest, *newest)
+            for meter, newest in self._newest.get(feeder, {}).items()
         ]
 
     def restore(self, feeder: str, orders: Iterable[SignedOrder]) -> None:
         """Take over the newest readings of an earlier process, of meters that have the same key."""
+        newest = self._newest.setdefault(feeder, {})
         for meter, digest, *order in orders:
-            place = feeder, meter
-            entry = self.entries.get(place)
+            entry = self.entries.get((feeder, meter))
             if entry is not None and entry.digest == digest:
-                self._newest[place] = max(self._newest.get(place, (-1, -1)), (order[0], order[1]))
+                newest[meter] = max(newest.get(meter, (-1, -1)), (order[0], order[1]))
 
     def check(
         self, feeder: str, meter: str | None, key: str, payload: bytes, attachment: bytes
@@ -116,8 +116,8 @@ class MeterKeys:
         key
             zenoh key of the sample.
         """
-        place = feeder, BUSBAR if meter is None else meter
-        entry = self.entries.get(place)
+        source = BUSBAR if meter is None else meter
+        entry = self.entries.get((feeder, source))
         if entry is None:
             return None if self.accepts_unlisted else Refusal("signature", "the meter has no key in the list")
         sender = _concentrator(key)
@@ -129,11 +129,12 @@ class MeterKeys:
         order = _signed_order(entry, key, payload, attachment)
         if isinstance(order, str):
             return Refusal("signature", order)
-        newest = self._newest.get(place, (-1, -1))
+        orders = self._newest.setdefault(feeder, {})
+        newest = orders.get(source, (-1, -1))
         if order <= newest:
             text = f"epoch:seq is {order[0]}:{order[1]}, not after {newest[0]}:{newest[1]}"
             return Refusal("replayed", text)
-        self._newest[place] = order
+        orders[source] = order
         self.changed.add(feeder)
         return None
 

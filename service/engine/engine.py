@@ -43,17 +43,18 @@ from service.engine.commissioning import CommissioningProgress, FeederCommission
 from service.engine.feeder_monitor import FeederMonitor, Suspicions, TickResult, align_rules, known_of
 from service.engine.load import FeederLoad, LoadControl
 from service.engine.operators import SHELVE_MOST_S, Operators
+from service.engine.orphans import Orphans, Standing, read_standing
 from service.errors import FeederUnknown
 from service.ingest.align import Clock
 from service.ingest.decode import Wire
 from service.ingest.queues import Inbox, Sample
-from service.ingest.reading import BadReading, BadReason, Reading, Readings, head_of
+from service.ingest.reading import BadReading, BadReason, Known, Reading, Readings, head_of
 from service.metrics import Metrics
 from service.report.feeder_info import Ownership
 from service.report.report import BUSBAR, FeederReport
 from service.report.tick_state import TickState
 from service.store import Rejected, Store
-from service.store.committer import Committer, Executor, Publisher, Wish, alarm_key, incident_key, inline
+from service.store.committer import Committer, Executor, Wish, alarm_key, incident_key, inline
 from service.store.schema import CommissioningEvent
 from service.store.series import Mark, mark, worth_keeping
 from service.store.state_codec import KeptInvalid, StateSnapshot, decode_signed, encode_signed
@@ -266,6 +267,7 @@ class Engine:
         self._wakes: dict[str, float] = {}
         self._until = self._order_kept = -math.inf
         self.load = LoadControl(clock)
+        self._clock, self._orphans = clock, Orphans()
         for site in sites:
             self.add(site)
 
@@ -297,7 +299,7 @@ class Engine:
             monitor.set_shed(True)
         self.unloaded.pop(name, None)
         self._restore_order(name, past.signed)
-        self._learn()
+        self._learn({**self._wire.known, name: known_of(site)})
         return monitor
 
     def _restore_order(self, name: str, kept: StateSnapshot | None) -> None:
@@ -384,10 +386,10 @@ class Engine:
         self.monitors = {other: kept for other, kept in self.monitors.items() if other != name}
         for table in (self._wakes, self._marks, self.reported, self.load.feeders):
             table.pop(name, None)
-        self._learn()
+        self._learn({other: known for other, known in self._wire.known.items() if other != name})
         self.metrics.forget(name)
         if self.committer.publisher is not None:
-            self.committer.publisher.withdraw(f"{name}/estimate")
+            self.committer.publisher.withdraw(name)
 
     # ---------------------------------------------------------------- feeders of a worker
 
@@ -442,32 +444,38 @@ class Engine:
         answer: Future[None] = Future()
         leaving = [self.monitors[name] for name in names if name in self.monitors]
         self.keep_states(leaving, at_once=True)
-        landed = _landing(answer, lambda: None)
-        self.committer.look(lambda _: None, lambda _: landed(), partial(_refuse, answer))
+        landed = _landing(answer, partial(self._withdraw, names))
+
+        def refused(error: GridsecError) -> None:
+            self._withdraw(names)
+            _refuse(answer, error)
+
+        self.committer.look(lambda _: None, lambda _: landed(), refused)
         for monitor in leaving:
-            if self.committer.publisher is not None:
-                self._withdraw(self.committer.publisher, monitor)
             self._drop(monitor.name)
         return answer
 
-    @staticmethod
-    def _withdraw(publisher: Publisher, monitor: FeederMonitor) -> None:
-        """Remove the replies to queries for a feeder: its next owner has newer ones."""
-        for alarm in monitor.book.active:
-            publisher.withdraw(alarm_key(alarm))
+    def _withdraw(self, names: Collection[str]) -> None:
+        """Remove the replies to queries for left feeders, also those of their last commit."""
+        for name in names:
+            if self.committer.publisher is not None and name not in self.monitors:
+                self.committer.publisher.withdraw(name)
 
-    def _learn(self) -> None:
-        known = {name: known_of(monitor.site) for name, monitor in self.monitors.items()}
+    def _learn(self, known: Mapping[str, Known]) -> None:
+        """Decode readings of these feeders from now on."""
         self._wire = Wire(known, self.config.prefix, self.config.max_payload, self.config.meter_keys)
 
     def begin(self, given: Collection[str] = ()) -> None:
         """Set the replies for standing alarms; publish the stored alarms of an earlier process.
 
         Alarms of feeders that are neither monitored nor stored any more are cleared here: no monitor does it.
-        `given` are further feeders, which this process monitors later.
+        `given` are further feeders, which this process monitors later. A worker has no feeders yet: `adopt`
+        and `_clear_orphans` follow its claims.
         """
+        if self.store.shared:
+            return
         ours, t = {*self.monitors, *self.unloaded, *self.store.feeders(), *given}, self._wall()
-        standing = [alarm for alarm in self.store.active() if self.store.mine(alarm.feeder)]
+        standing = self.store.active()
         left_out = [alarm for alarm in standing if alarm.feeder not in ours]
         self.committer.waiting.add(transitions=close(left_out, t, NOT_WATCHED))
         if self.committer.publisher is not None:
@@ -475,12 +483,25 @@ class Engine:
                 if alarm.feeder in ours:
                     self.committer.publisher.answer(alarm_key(alarm), msgspec.json.encode(alarm_json(alarm)))
             for event in self.store.open_incident_events():
-                if event.incident.feeder in ours and self.store.mine(event.incident.feeder):
+                if event.incident.feeder in ours:
                     payload = msgspec.json.encode(event_json(event))
                     self.committer.publisher.answer(incident_key(event.incident), payload)
         for name in self.unloaded:
             self.metrics.alarms.labels(name).set(sum(alarm.feeder == name for alarm in standing))
         self.committer.commit()
+
+    def _clear_orphans(self) -> None:
+        """Start a read of the alarms of removed feeders, if one is due after a claim; they are cleared."""
+        committer = self.committer
+        if not self.store.shared or committer.storing or committer.problem is not None:
+            return
+
+        def clear(read: Standing) -> None:
+            left_out = self._orphans.found(read, self.monitors)
+            committer.waiting.add(transitions=close(left_out, self._wall(), NOT_WATCHED))
+
+        if self._orphans.due(self.store.held, self._clock()):
+            committer.look(read_standing, clear, lambda _: None)
 
     # ---------------------------------------------------------------- one round
 
@@ -491,6 +512,7 @@ class Engine:
         there is a new report.
         """
         started, begun = time.perf_counter(), time.thread_time()
+        self._clear_orphans()
         bad = self._place(samples)
         self._keep_order(at_once=False)
         self._reach(self._wall(), oldest())

@@ -350,10 +350,12 @@ class Bus:
         with self._answers_lock:
             self._answers[f"{self._prefix}/{key}"] = payload
 
-    def withdraw(self, key: str) -> None:
-        """Remove the reply to queries for a key."""
+    def withdraw(self, feeder: str) -> None:
+        """Remove the replies to queries for all keys of a feeder."""
+        below = f"{self._prefix}/{feeder}/"
         with self._answers_lock:
-            self._answers.pop(f"{self._prefix}/{key}", None)
+            for key in [key for key in self._answers if key.startswith(below)]:
+                del self._answers[key]
 
     def _publish(self, live: zenoh.Session) -> None:
         publishers: dict[str, zenoh.Publisher] = {}

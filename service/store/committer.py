@@ -233,8 +233,8 @@ class Publisher(Protocol):
     def answer(self, key: str, payload: bytes) -> None:
         """Store the reply to queries for a key."""
 
-    def withdraw(self, key: str) -> None:
-        """Remove the reply to queries for a key."""
+    def withdraw(self, feeder: str) -> None:
+        """Remove the replies to queries for all keys of a feeder."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
@@ -349,6 +350,7 @@ _PRUNED_AT_ONCE = 5000
 """
 ALONE_S = 5.0
 """Wait of a write for the previous one, s."""
+_NO_LEASES: Mapping[int, Lease] = MappingProxyType({})
 _STEADY_S = 86_400.0
 """Time for which a feeder must have reported before anything is deleted, s."""
 _log = structlog.get_logger("gridsec.store")
@@ -376,7 +378,7 @@ class Store(Reader):
         super().__init__(Connections(url, worker=None if leases is None else leases.number))
         self._leases = leases
         # Leases at the last change of `_due` and of the caches, and at the last take-over.
-        self._known = self._taken = self._held
+        self._known = self._taken = self.held
         self._history_rules = history or HistoryRules()
         self.history_step_s = self._history_rules.step_s
         self._lock = threading.RLock()
@@ -404,6 +406,8 @@ class Store(Reader):
         self._last_event = int(newest or 0)
         self._last_incident_event = int(newest_incident or 0)
         self._suppression_changes = 0
+        # Key of the last commit, and the newest event before its first attempt.
+        self._attempt: tuple[int | None, int] = None, self._last_event
         if (beat_s := self._connections.beat_s) is not None:
             threading.Thread(
                 target=self._beat, args=(beat_s,), name="gridsec-store-beat", daemon=True
@@ -465,8 +469,14 @@ class Store(Reader):
         return self._suppression_changes
 
     @property
-    def _held(self) -> Mapping[int, Lease]:
-        return {} if self._leases is None else self._leases.held
+    def shared(self) -> bool:
+        """True if other workers write beside this process."""
+        return self._leases is not None
+
+    @property
+    def held(self) -> Mapping[int, Lease]:
+        """Leases of this process by shard; another object after each change. Empty without workers."""
+        return _NO_LEASES if self._leases is None else self._leases.held
 
     def mine(self, feeder: str) -> bool:
         """True if this process writes a feeder; without a call to the database."""
@@ -477,8 +487,7 @@ class Store(Reader):
 
         A shelf or a planned work changes, or the leases have changed.
         """
-        moved = self._leases is not None and self._leases.held is not self._known
-        return moved or (self._due is not None and self._due <= now)
+        return self.held is not self._known or (self._due is not None and self._due <= now)
 
     def refresh(self) -> None:
         """Read `last_event` and `last_incident_event`: other processes add events, too."""
@@ -510,7 +519,7 @@ class Store(Reader):
 
     def take_over(self) -> tuple[list[AlarmEvent], list[IncidentEvent]]:
         """Return the unpublished events of the shards that were claimed since the last call."""
-        held = self._held
+        held = self.held
         new = {shard for shard, lease in held.items() if self._taken.get(shard) != lease}
         if not new:
             self._taken = held
@@ -556,14 +565,11 @@ class Store(Reader):
     def _numbering() -> sa.ColumnElement[Any]:
         return sa.func.pg_advisory_xact_lock(_EVENT_LOCK)
 
-    def _adopt(self) -> None:
+    def _forget_others(self) -> None:
         """Forget the feeders of released and lost shards: other workers continue their history."""
-        held = self._held
-        if held is not self._known:
-            for cache in (self._marks, self._rolled, self._since_prune):
-                for feeder in [name for name in cache if not self.mine(name)]:
-                    cache.pop(feeder)
-            self._known = held
+        for cache in (self._marks, self._rolled, self._since_prune):
+            for feeder in [name for name in cache if not self.mine(name)]:
+                cache.pop(feeder)
 
     def commit(
         self,
@@ -602,9 +608,10 @@ class Store(Reader):
         if now is None:
             now = max((item.t for item in transitions), default=-math.inf)
         with self._alone():
-            due_now = self.due(now)
+            held, due_now = self.held, self.due(now)
             grouped = bool(transitions or actions or due_now)
-            self._adopt()
+            if held is not self._known:
+                self._forget_others()
             marks, rolled = dict(self._marks), dict(self._rolled)
             worthy = [report for report in reports if self._worth(marks, report)]
             if not (grouped or worthy or rejected or kept or happened or without or put):
@@ -614,6 +621,8 @@ class Store(Reader):
             feeders |= {item.feeder for item in happened}
             feeders |= {name for name in (without, put and put[0]) if name is not None}
             newest, following = self._last_incident_event, self._due
+            if key is None or key != self._attempt[0]:
+                self._attempt = key, self._last_event
             suppressions = self._suppression_changes + bool(actions or due_now)
             with self._connections.write_once(key) as (connection, stored):
                 if stored:
@@ -640,7 +649,8 @@ class Store(Reader):
                     moved = due_now or incidents.suppressions_change(grouping)
                 if moved:
                     following = incidents.next_due(connection, self.mine)
-            self._marks, self._rolled, self._due = marks, rolled, following
+            self._marks, self._rolled = marks, rolled
+            self._known, self._due = held, following
             self._last_incident_event = max(self._last_incident_event, newest)
             self._suppression_changes = suppressions
             self._last_event = max((self._last_event, *numbers))
@@ -680,7 +690,8 @@ class Store(Reader):
     ) -> tuple[int, ...]:
         """Return the numbers of the events of a commit that was stored before."""
         e, feeders = EVENT.c, {item.alarm.feeder for item in transitions}
-        newer = sa.select(e.seq).where(e.seq > self._last_event, e.feeder.in_(feeders)).order_by(e.seq)
+        # `refresh` may have moved `_last_event` beyond them since.
+        newer = sa.select(e.seq).where(e.seq > self._attempt[1], e.feeder.in_(feeders)).order_by(e.seq)
         return tuple(connection.scalars(newer.limit(len(transitions))))
 
     def _put_events(

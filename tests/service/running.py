@@ -91,8 +91,8 @@ class Outlet:
         if "incident" not in found:
             self.answers.append(f"{key} {found['id']}")
 
-    def withdraw(self, key: str) -> None:
-        self.withdrawn.append(key)
+    def withdraw(self, feeder: str) -> None:
+        self.withdrawn.append(feeder)
 
 
 class InProcess:

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from feeders.model.site import Site
+from feeders.model.site import Site, from_tables
 from feeders.registry import DesignedEstimator
 from gridsec.interface import Frame
 from service.alarms.state_machine import (
@@ -313,7 +313,7 @@ def test_a_deleted_feeder_leaves_cleared_alarms_and_its_history(
         assert {alarm.state for alarm in alarms} == {AlarmState.CLEARED}
         assert store.events(alarms[0].id)[-1].comment == NOT_WATCHED
         assert [(a["state"], last) for a, last in outlet.events[2:]] == [("cleared", True)] * 2
-        assert outlet.withdrawn == [f"{FEEDER}/estimate"]
+        assert outlet.withdrawn == [FEEDER]
         assert store.history(FEEDER)
         assert "gridsec_alarms_active{" not in live.metrics.exposition().decode()
         live.cycle(until(attacked, 15.0)[1][:1])
@@ -348,6 +348,20 @@ def test_alarms_of_a_feeder_that_was_left_out_are_cleared_at_the_start(
         number = store.last_event
         rounds(store, site)
         assert store.last_event == number
+
+
+def test_another_feeder_leaves_the_decoders_of_the_others(site: Site, path: Path) -> None:
+    meta = site.tables.meta
+    other = from_tables(replace(site.tables, meta=replace(meta, name="other", voltage_volt=240.0)))
+    with Store(f"sqlite:///{path}") as store:
+        live = rounds(store, site)
+        before = live._wire.known[FEEDER]
+        live.add(other)
+        assert live._wire.known.keys() == {FEEDER, "other"}
+        assert live._wire.known[FEEDER] is before
+        assert live._wire.known["other"].nominal_volt == 240.0
+        live.resign(["other"]).result()
+        assert live._wire.known == {FEEDER: before}
 
 
 def test_of_two_alarms_that_tell_the_same_none_stands_for_ever(site: Site, path: Path) -> None:

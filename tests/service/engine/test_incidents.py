@@ -67,6 +67,44 @@ def test_an_attack_is_one_incident_published_after_it_is_stored(
         assert (store.last_incident_event, live.committer.storing) == (number, False)
 
 
+class Replies(Outlet):
+    """An outlet with the present replies to queries."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.present: set[str] = set()
+
+    def event(self, key: str, payload: bytes, *, last: bool, **options: Any) -> bool:
+        (self.present.discard if last else self.present.add)(key)
+        return super().event(key, payload, last=last, **options)
+
+    def withdraw(self, feeder: str) -> None:
+        super().withdraw(feeder)
+        self.present = {key for key in self.present if not key.startswith(f"{feeder}/")}
+
+
+def test_a_left_feeder_has_no_replies_also_of_its_last_commit(
+    site: Site, attacked: list[Sample], path: Path
+) -> None:
+    first, later = until(until(attacked, 15.0)[0], 2.0)
+    outlet = Replies()
+    pending: list[Callable[[], None]] = []
+    with Store(f"sqlite:///{path}") as store:
+        live = rounds(store, site, outlet)
+        live.committer._apart = lambda write, then: pending.append(lambda: then(write()))
+        live.cycle(first)
+        live.cycle(later)  # its alarms wait for the write in progress
+        pending.pop()()
+        assert store.active() == []
+        answer = live.resign([FEEDER])
+        assert len(outlet.withdrawn) == 1
+        pending.pop()()
+        of(answer)
+        assert len(store.active()) == len(outlet.events) == 2
+        assert len(outlet.incidents) == 1
+        assert outlet.present == set()
+
+
 @pytest.fixture
 def live(site: Site, attacked: list[Sample], path: Path) -> Any:
     """Rounds with two alarms of one attack."""

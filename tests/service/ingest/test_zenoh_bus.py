@@ -163,6 +163,10 @@ def test_estimates_and_alarms_are_published_and_answer_queries() -> None:
         assert bus.event("f/alarm/A", b"cleared", last=True, done=lambda: done.append("cleared"))
         until(lambda: len(done) == 2)
         assert set(meters.query("f/alarm/*", 2.0)) == {"gridsec/f/alarm/B"}
+        bus.answer("f/incident/C", b"open")
+        bus.answer("f2/incident/D", b"open")
+        bus.withdraw("f")
+        assert set(meters.query("**", 2.0)) == {"gridsec/f2/incident/D"}
         heard = [events.handler.recv() for _ in range(3)]
         assert [(h.kind, h.payload.to_bytes()) for h in heard] == [
             (zenoh.SampleKind.PUT, b"raised"),

@@ -10,6 +10,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from multiprocessing.synchronize import Barrier
 from random import Random
+from typing import Any
 
 import psycopg
 import pytest
@@ -210,6 +211,41 @@ def test_a_committer_drops_lost_feeders_and_publishes_those_taken_over(url: str,
     assert [alarm.id for alarm in first.store.active(feeder)] == [an_alarm(1).id]
 
 
+def lose_the_answer(store: Store) -> None:
+    """Break the connection of the writer after its next commit has been executed."""
+    dialect: Any = store._connections._engines[0].dialect
+    commit = dialect.do_commit
+
+    def do_commit(connection: Any) -> None:
+        dialect.do_commit = commit
+        commit(connection)
+        connection.dbapi_connection.close()
+        raise psycopg.OperationalError("the connection is closed")
+
+    dialect.do_commit = do_commit
+
+
+def test_a_claim_before_a_repeated_commit_changes_no_number(url: str, join: Join) -> None:
+    first, second = join("a", "b")
+    (feeder,), (other,) = first.feeders(), second.feeders()
+    theirs: list[str] = []
+    committer = committer_of(second.store, theirs)
+    committer.commit()
+    committer.waiting.add(transitions=[raised(an_alarm(k, feeder=other)) for k in (1, 2)])
+    lose_the_answer(second.store)
+    committer.commit()
+    assert committer.problems()
+    first.store.commit([raised(an_alarm(3, feeder=feeder))])
+    hand_over(url, first, second)
+    for _ in range(3):
+        committer.commit(at_once=True)
+    assert committer.problem is None
+    alarms = [key.split("/")[0] for key in theirs if "/alarm/" in key]
+    assert sorted(alarms) == sorted([feeder, other, other])
+    assert second.store.outbox_pending() == second.store.incidents_unpublished() == []
+    assert len(second.store.active()) == 3
+
+
 def test_shelves_end_with_the_owner_of_their_feeder(url: str, join: Join) -> None:
     first, second = join("a", "b")
     (feeder,) = first.feeders()
@@ -225,6 +261,28 @@ def test_shelves_end_with_the_owner_of_their_feeder(url: str, join: Join) -> Non
     assert first.store.shelves(standing=True)
     hand_over(url, first, second)
     assert second.store.due(T0 + 11)
+    second.store.commit(now=T0 + 11)
+    assert second.store.shelves(standing=True) == []
+
+
+def test_a_failed_commit_does_not_hide_the_shelves_of_new_feeders(url: str, join: Join) -> None:
+    first, second = join("a", "b")
+    (feeder,) = first.feeders()
+    alarm = an_alarm(1, feeder=feeder)
+    shelf = Shelf(
+        "S" * 26, feeder, alarm.id, None, None, None, alarm.severity, "Ada", "", t=T0 + 2, until=T0 + 10
+    )
+    first.store.commit([raised(alarm)], actions=[shelf], now=T0 + 2)
+    second.store.commit(now=T0 + 2)
+    hand_over(url, first, second)
+    with psycopg.connect(url.replace("+psycopg", ""), autocommit=True) as admin:
+        admin.execute("ALTER TABLE shelf RENAME TO away")
+        with refused(StoreUnavailable, "write-failed"):
+            second.store.commit(now=T0 + 3)
+        admin.execute("ALTER TABLE away RENAME TO shelf")
+    assert second.store.due(T0 + 3)
+    second.store.commit(now=T0 + 3)
+    assert not second.store.due(T0 + 3)
     second.store.commit(now=T0 + 11)
     assert second.store.shelves(standing=True) == []
 
