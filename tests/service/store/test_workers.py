@@ -242,7 +242,7 @@ def test_a_claim_before_a_repeated_commit_changes_no_number(url: str, join: Join
     assert committer.problem is None
     alarms = [key.split("/")[0] for key in theirs if "/alarm/" in key]
     assert sorted(alarms) == sorted([feeder, other, other])
-    assert second.store.outbox_pending() == second.store.incidents_unpublished() == []
+    assert (second.store.outbox_pending(), second.store.incidents_unpublished()) == ([], [])
     assert len(second.store.active()) == 3
 
 
