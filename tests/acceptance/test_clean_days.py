@@ -146,7 +146,7 @@ def test_the_benchmark_fails_where_there_are_more_alarms_than_asked_for(
 ) -> None:
     """Meters of six times their class: many are named, and the answer is 1."""
     monkeypatch.setattr("benchmarks.clean_days.names", lambda **_: ("cigre-lv",))
-    assert main(0.02, None) == 0
+    assert main(0.02, None, None, None) == 0
     assert "| cigre-lv | autumn |" in capsys.readouterr().out
 
     def wrong(*args: Any) -> Run:
@@ -154,4 +154,4 @@ def test_the_benchmark_fails_where_there_are_more_alarms_than_asked_for(
         return replace(run, scenario=replace(run.scenario, errors=MeterErrors(bias=6.0)))
 
     monkeypatch.setattr("benchmarks.clean_days.plan", wrong)
-    assert main(0.02, None) == 1
+    assert main(0.02, None, None, None) == 1
