@@ -14,7 +14,7 @@ from pathlib import Path
 from benchmarks._arguments import arguments
 from feeders.model.site import load
 from tests.service.clusters import served_cluster
-from tests.service.databases import Cluster, find_postgresql
+from tests.service.databases import find_postgresql, running
 from tests.service.failovers import OUTAGE_S, Fault, Trial
 
 WORKERS = 3
@@ -27,23 +27,16 @@ def main() -> None:
     if binaries is None:
         raise SystemExit("PostgreSQL's initdb, pg_ctl and postgres are not installed")
     with (
-        tempfile.TemporaryDirectory(prefix="gridsec-pg-", dir="/tmp") as data,
+        running(binaries) as server,
         tempfile.TemporaryDirectory(prefix="gridsec-failover-") as folder,
+        served_cluster(Path(folder), server.database(), load("cigre-lv"), given.feeders, WORKERS) as live,
     ):
-        server = Cluster(binaries, Path(data))
-        server.start()
-        try:
-            with served_cluster(
-                Path(folder), server.database(), load("cigre-lv"), given.feeders, WORKERS
-            ) as live:
-                trial = Trial(live, server, random.Random(int(time.time())))
-                trial.begin()
-                for _ in range(given.repetitions):
-                    for fault in (Fault.STOP, Fault.KILL, Fault.FREEZE, Fault.TERMINATE, Fault.ROUTER):
-                        print(f"{fault}: {trial.strike(fault):.1f} s", flush=True)
-                print(f"{Fault.OUTAGE} of {OUTAGE_S:g} s: {trial.strike(Fault.OUTAGE):.1f} s", flush=True)
-        finally:
-            server.stop()
+        trial = Trial(live, server, random.Random(int(time.time())))
+        trial.begin()
+        for _ in range(given.repetitions):
+            for fault in (Fault.STOP, Fault.KILL, Fault.FREEZE, Fault.TERMINATE, Fault.ROUTER):
+                print(f"{fault}: {trial.strike(fault):.1f} s", flush=True)
+        print(f"{Fault.OUTAGE} of {OUTAGE_S:g} s: {trial.strike(Fault.OUTAGE):.1f} s", flush=True)
     print(
         "\nTimes in s, median and largest.\n\n| fault | repetitions | judged | decided |\n|---|---|---|---|"
     )

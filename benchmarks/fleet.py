@@ -55,6 +55,7 @@ from service.store import Store
 from service.store.committer import Committer
 from tests.service.databases import Cluster as Server
 from tests.service.databases import find_postgresql
+from tests.service.databases import running as running_server
 
 FEEDER = "kerber-vorstadtnetz"
 FORMATS = {
@@ -400,21 +401,6 @@ def spent_s(process: int) -> float:
     return own + sum(spent_s(int(one)) for one in children)
 
 
-@contextmanager
-def postgresql() -> Iterator[Server]:
-    """Run a server of PostgreSQL until the block ends."""
-    binaries = find_postgresql()
-    if binaries is None:
-        raise SystemExit("PostgreSQL's initdb, pg_ctl and postgres are not installed")
-    with tempfile.TemporaryDirectory(prefix="gridsec-pg-", dir="/tmp") as data:
-        server = Server(binaries, Path(data))
-        server.start()
-        try:
-            yield server
-        finally:
-            server.stop()
-
-
 def holds(
     site: Site,
     folder: Path,
@@ -498,7 +484,10 @@ def main() -> int:
         print_against(site, asked.seconds, Path(asked.against).resolve())
         return 0
     if asked.workers:
-        with postgresql() as server:
+        binaries = find_postgresql()
+        if binaries is None:
+            raise SystemExit("PostgreSQL's initdb, pg_ctl and postgres are not installed")
+        with running_server(binaries) as server:
             print_fleet(site, asked.seconds, asked.most, server)
         return 0
     tick = print_stages(site)

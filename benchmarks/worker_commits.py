@@ -9,19 +9,17 @@ Limit: the median difference of neighbouring commits is below a tenth of a commi
 
 from __future__ import annotations
 
-import tempfile
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import sqlalchemy as sa
 
 from service.store import Store, leases
 from service.store.leases import Leases
-from tests.service.databases import Cluster, find_postgresql
+from tests.service.databases import Cluster, find_postgresql, running
 from tests.service.stored import an_alarm, raised
 
 PAIRS, BESIDE, WORKERS, LIMIT = 400, 200, 4, 0.1
@@ -92,13 +90,8 @@ def main() -> None:
         print("PostgreSQL is not installed")
         return
     leases.SETTLE_S = 0.0  # type: ignore[misc]
-    with tempfile.TemporaryDirectory(prefix="gridsec-pg-", dir="/tmp") as folder:
-        cluster = Durable(binaries, Path(folder))
-        cluster.start()
-        try:
-            measure(cluster.database())
-        finally:
-            cluster.stop()
+    with running(binaries, Durable) as cluster:
+        measure(cluster.database())
 
 
 def measure(url: str) -> None:

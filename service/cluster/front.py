@@ -29,6 +29,7 @@ from service.cluster.forward import DESIGN_S, Forwarder, Workers, get
 from service.cluster.messages import Call
 from service.engine.commissioning import CommissioningProgress
 from service.engine.operators import Operators
+from service.engine.runtime import WakeUps
 from service.errors import FeederUnknown, NoOwner, WorkerBusy
 from service.metrics import Metrics
 from service.report.feeder_info import Ownership
@@ -139,7 +140,7 @@ class Front:
         self._registered: list[str] = []
         self._newest = (store.last_event, store.last_incident_event)
         self._read = asyncio.Event()
-        self._subscribers: set[asyncio.Queue[str]] = set()
+        self._streams = WakeUps()
         self._stopping = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._latest: dict[str, tuple[tuple[str, int, float], FeederReport]] = {}
@@ -188,7 +189,7 @@ class Front:
         newest = (self.store.last_event, self.store.last_incident_event)
         if newest != self._newest:
             self._newest = newest
-            self._notify("alarm")
+            self._streams.notify("alarm")
 
     async def refresh(self) -> None:
         """Read the feeders and the newest events of the database."""
@@ -202,7 +203,7 @@ class Front:
         self._problem = None
         self._read.set()
         if changes.added or changes.removed:
-            self._notify("state")
+            self._streams.notify("state")
 
     async def _put_given(self) -> None:
         """Put the feeders of the command line into the database, through the owners of their shards."""
@@ -237,31 +238,16 @@ class Front:
     def stop(self) -> None:
         """End `run` and every subscription soon; called from the event loop."""
         self._stopping.set()
-        self._notify("stop")
+        self._streams.end()
 
     def heard(self) -> None:
         """Wake streams after a message of a worker; called from any thread."""
         if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._notify, "state")
+            self._loop.call_soon_threadsafe(self._streams.notify, "state")
 
-    def _notify(self, kind: str) -> None:
-        for queue in self._subscribers:
-            if queue.full():
-                queue.get_nowait()
-            queue.put_nowait(kind)
-
-    async def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:
+    def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:
         """Yield a wake-up after each stored alarm and each message of a worker, until the service stops."""
-        queue: asyncio.Queue[str] = asyncio.Queue(maxsize=4)
-        self._subscribers.add(queue)
-        try:
-            while not self._stopping.is_set():
-                kind = await queue.get()
-                if kind == "stop":
-                    return
-                yield {"type": kind, "data": None}
-        finally:
-            self._subscribers.discard(queue)
+        return self._streams.subscribe()
 
     # ---------------------------------------------------------------------------------------------- feeders
 

@@ -49,11 +49,46 @@ IDLE_S = 1.0
 STUCK_S = 30.0
 COMMAND_S = 10.0
 """Time limit of a command with the database, s: an earlier write and its own."""
+WAITING = 4
+"""Wake-ups that wait for one reader: a later one replaces the oldest."""
 STOPPING = "the service is stopping"
 
 T = TypeVar("T")
 
 _log = structlog.get_logger("gridsec.runtime")
+
+
+class WakeUps:
+    """Wake-ups of streams. A slow reader finds the latest `WAITING`. Used from the event loop only."""
+
+    def __init__(self) -> None:
+        self._queues: set[asyncio.Queue[str]] = set()
+        self._ended = False
+
+    def notify(self, kind: str) -> None:
+        """Wake all subscribers."""
+        for queue in self._queues:
+            if queue.full():
+                queue.get_nowait()
+            queue.put_nowait(kind)
+
+    def end(self) -> None:
+        """End every subscription soon."""
+        self._ended = True
+        self.notify("stop")
+
+    async def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:
+        """Yield each wake-up until `end`."""
+        queue: asyncio.Queue[str] = asyncio.Queue(maxsize=WAITING)
+        self._queues.add(queue)
+        try:
+            while not self._ended:
+                kind = await queue.get()
+                if kind == "stop":
+                    return
+                yield {"type": kind, "data": None}
+        finally:
+            self._queues.discard(queue)
 
 
 class Runtime:
@@ -84,7 +119,7 @@ class Runtime:
             store,
             sites,
             wall=wall,
-            stored=lambda: self._in_loop(partial(self._notify, "alarm")),
+            stored=lambda: self._in_loop(partial(self._streams.notify, "alarm")),
             apart=self._write_apart,
             unloaded=unloaded,
             go_on=lambda: not self._stopping and config.acts(),
@@ -102,7 +137,7 @@ class Runtime:
         self._dropped = 0
         self._commands: deque[tuple[Callable[[], Future[Any]], asyncio.Future[Any]]] = deque()
         self._prepared: set[asyncio.Future[tuple[Site, DesignedEstimator]]] = set()
-        self._subscribers: set[asyncio.Queue[str]] = set()
+        self._streams = WakeUps()
         self._outcomes: deque[Callable[[], None]] = deque()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="gridsec-round")
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="gridsec-store")
@@ -150,7 +185,7 @@ class Runtime:
                 self._last_round = time.monotonic()
                 self._engine.metrics.queue.set(len(self._inbox))
                 if news:
-                    self._notify("state")
+                    self._streams.notify("state")
                 await self._pause()
             await self._end()
             self._check_writer()
@@ -187,7 +222,7 @@ class Runtime:
             if not prepared.done():
                 prepared.set_exception(StoreUnavailable(STOPPING, code="stopping"))
         self._wake.set()
-        self._notify("stop")
+        self._streams.end()
 
     def _samples(self) -> list[Sample]:
         """Return the samples of the next round; with `Clock.EVENTS` none before the last ones are stored."""
@@ -476,14 +511,14 @@ class Runtime:
     async def adopt(self, sites: Sequence[Site]) -> None:
         """Go on with feeders of another process as `Engine.adopt` does; their designs follow."""
         await self._command(partial(self._engine.adopt, sites, self._design))
-        self._notify("state")
+        self._streams.notify("state")
 
     async def resign(self, names: Collection[str]) -> None:
         """End the monitoring of feeders as `Engine.resign` does; their state is stored when this returns."""
         await self._command(partial(self._engine.resign, names))
         for name in names:
             self._inbox.forget(name)
-        self._notify("state")
+        self._streams.notify("state")
 
     def set_unloaded(self, reasons: Mapping[str, str]) -> None:
         """Note the feeders of this process that cannot be loaded, with the reasons."""
@@ -505,7 +540,7 @@ class Runtime:
         if name in self._given:
             raise FeederFixed(name)
         await self._command(partial(self._engine.remove, name))
-        self._notify("state")
+        self._streams.notify("state")
 
     async def acknowledge(self, alarm_id: str, who: str, comment: str, *, count: int | None = None) -> Alarm:
         """Acknowledge an alarm as `Engine.acknowledge` does; it is stored when this returns."""
@@ -526,21 +561,6 @@ class Runtime:
         """Restart the learning as `Engine.recommission` does; it is stored when this returns."""
         return await self._command(partial(self._engine.recommission, name, meters, who, reason))
 
-    async def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:
+    def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:
         """Yield a wake-up after each stored alarm and each new report, until the service stops."""
-        queue: asyncio.Queue[str] = asyncio.Queue(maxsize=4)
-        self._subscribers.add(queue)
-        try:
-            while not self._stopping:
-                kind = await queue.get()
-                if kind == "stop":
-                    return
-                yield {"type": kind, "data": None}
-        finally:
-            self._subscribers.discard(queue)
-
-    def _notify(self, kind: str) -> None:
-        for queue in self._subscribers:
-            if queue.full():
-                queue.get_nowait()
-            queue.put_nowait(kind)
+        return self._streams.subscribe()

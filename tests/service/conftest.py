@@ -7,7 +7,6 @@ import math
 import os
 import secrets
 import shutil
-import tempfile
 import threading
 import time
 from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
@@ -47,7 +46,7 @@ from service.store import Store
 from service.store.committer import Wish
 from service.store.schema import CommissioningChange, CommissioningEvent
 from tests.service.asking import T0, Setup
-from tests.service.databases import Cluster, find_postgresql
+from tests.service.databases import Cluster, find_postgresql, running
 from tests.service.looking import Site
 from tests.service.reports import acknowledge
 
@@ -438,13 +437,8 @@ def cluster() -> Iterator[Cluster]:
         pytest.skip("PostgreSQL's initdb, pg_ctl and postgres are not installed")
     if os.geteuid() == 0 and shutil.which("setpriv") is None:
         pytest.skip("PostgreSQL refuses to run as root, and there is no setpriv to become somebody else")
-    with tempfile.TemporaryDirectory(prefix="gridsec-pg-", dir="/tmp") as folder:
-        made = Cluster(binaries, Path(folder))
-        made.start()
-        try:
-            yield made
-        finally:
-            made.stop()
+    with running(binaries) as made:
+        yield made
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import subprocess
+import tempfile
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -78,3 +79,15 @@ class Cluster:
 
 
 both = pytest.mark.parametrize("family", ["sqlite", pytest.param("postgresql", marks=pytest.mark.postgresql)])
+
+
+@contextmanager
+def running(binaries: Path, kind: type[Cluster] = Cluster) -> Iterator[Cluster]:
+    """A PostgreSQL in a temporary folder, stopped with the block."""
+    with tempfile.TemporaryDirectory(prefix="gridsec-pg-", dir="/tmp") as folder:
+        made = kind(binaries, Path(folder))
+        made.start()
+        try:
+            yield made
+        finally:
+            made.stop()

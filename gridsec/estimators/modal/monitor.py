@@ -370,7 +370,7 @@ def _identified(
     certain = verdict.certain_inverters(design.front, kernel, suspicion, uses_q)
     inverters = np.where(certain, state.inverters + 1, 0)
     age = int(state.core.detector.onsets.age[suspicion.row])
-    # What was named once is searched again at the next tick.
+    # A fault with a first naming is searched again at the next tick.
     wait = 1 if any((each == 1).any() for each in (streak, phases, inverters)) else max(1, age // LOOKS)
     after = replace(
         state, suspicion=suspicion, streak=streak, phases=phases, inverters=inverters, due=tick + wait
