@@ -129,7 +129,13 @@ PROGRAM = "from service.cli.main import main; main()"
 
 @contextmanager
 def running(
-    tree: Path, folder: Path, names: Sequence[str], *, workers: int = 0, database: str | None = None
+    tree: Path,
+    folder: Path,
+    names: Sequence[str],
+    *,
+    workers: int = 0,
+    database: str | None = None,
+    start_s: float = START_S,
 ) -> Iterator[Service]:
     """Run the service of a source tree until the block ends: one process, or a front with workers."""
     http, zenoh = free_ports(2)
@@ -146,7 +152,7 @@ def running(
     with log.open("wb") as out, httpx.Client(base_url=f"http://127.0.0.1:{http}", timeout=30.0) as client:
         process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=environment, cwd=tree)
         try:
-            end = time.monotonic() + START_S
+            end = time.monotonic() + start_s
             while not _ready(client):
                 if process.poll() is not None or time.monotonic() > end:
                     raise SystemExit(f"the service did not start:\n{log.read_text()[-2000:]}")
