@@ -2,13 +2,13 @@
 
     python -m benchmarks.capacity [FEEDERS] [TICK_S] [SECONDS] [--workers]
 
-Feeders are copies of the Kerber suburban network, 146 meters and the busbar each. All meters of a feeder report
-in one batch in Arrow once in TICK_S; the feeders are spread over six tenths of it. The service is a process of
-its own with SQLite, or a front with two workers and PostgreSQL.
+Feeders are copies of the Kerber suburban network, 146 meters and the busbar each. All meters of a feeder
+report in one batch in Arrow once in TICK_S; the feeders are spread over six tenths of it. The service is a
+process of its own with SQLite, or a front with two workers and PostgreSQL.
 
 Cost model: cores, proportional set size of all processes, bytes/s of the database and bytes/s of the payloads
-are a fixed part and a part for each feeder. Both are measured with two small fleets, the larger of which has a
-fifth of the feeders, at most twice `LEAST`. The whole fleet is measured too, and compared with the model.
+are a fixed part and a part for each feeder. Both are measured with two small fleets, the larger of which has
+a fifth of the feeders, at most twice `LEAST`. The whole fleet is measured too, and compared with the model.
 
 The last table extrapolates to 1, 10 and 30 million meters at several ticks: cores with a load of `TARGET`,
 memory, disk a day, network. The cost of a feeder follows from the smallest and the whole fleet.
@@ -189,7 +189,7 @@ def main() -> int:
         for number in (few, 2 * few, asked.feeders)
     )
     print(
-        "| feeders | meters | cores | memory, MB | disk, kB/s | network, kB/s | start, s | clean | lost | delay |",
+        "| feeders | meters | cores | memory, MB | disk, kB/s | sent, kB/s | start | clean | lost | delay |",
         "|---|---|---|---|---|---|---|---|---|---|",
         sep="\n",
     )
