@@ -19,6 +19,7 @@ between its values at two successive frames (docs/theory-detection.md for the la
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 
@@ -68,6 +69,7 @@ from gridsec.estimators.sequential.state import (
     unknown_injections,
 )
 from gridsec.estimators.sequential.time_scales import Scales, Window, empty, forget, min_readings, push, shift
+from gridsec.grid.network import Power
 from gridsec.interface import Estimate, Explanation, Frame, Verdict
 from gridsec.observers.lure import POLICY, Lure, transition
 from gridsec.observers.lure import advance as advance_loop
@@ -77,6 +79,9 @@ _PATIENT = replace(POLICY, settled=0.0)
 
 _PAUSE = 60.0
 """Ticks without a frame that count as a pause."""
+
+_LATE = 1.5
+"""Ticks after the last frame from which on the voltages may have moved unseen."""
 
 
 _RENEW_TICKS, _RENEW_RATIO, _LEAST_SWING = 16, 1.1, 0.01
@@ -259,9 +264,9 @@ def _state(  # noqa: PLR0917
         now,
         t=frame.t,
         frame=frame,
-        since=frame.t if state.x is None else state.since,
         ticks=state.ticks + 1,
         x=predicted.x,
+        transient=predicted.transient,
         model_driven=model_driven,
         injection_error=error,
         v0_squared=measured.v0_squared,
@@ -353,11 +358,28 @@ def predict(
     """Prediction of a frame, with the sizes (k,) of false powers."""
     x, model_driven, error = _inverters(design, state, measured, sizes)
     powers = _powers(design, state, measured, x, sizes)
-    age = 0.0 if state.x is None else measured.frame.t - state.since
-    # Without inverters the rate is infinite; infinity times zero is NaN.
-    decay = np.exp(-design.certificate.rate * age) if age > 0 else 1.0
-    transient = np.asarray(design.inverter_reach * decay)
+    transient = state.transient if state.x is None else _transient(design, state, error.input, measured.frame)
     return Prediction(x, model_driven, error, powers, _voltages(design, powers), transient)
+
+
+def _transient(design: SequentialDesign, state: SequentialState, given: Floats, frame: Frame) -> Floats:
+    """Remainder of unknown injections in the squared voltages of the meters, (p,).
+
+        u' = -rate u + |2 X| |K(z) - K(z_before)| / tau
+
+    The second term counts after a pause of the frames only. The observer is driven by the voltages at its
+    end, `given` (m,), squared pu. The true voltages are between these and those before the pause.
+    """
+    rate, h, droop = design.certificate.rate, frame.t - state.t, design.plant.droop
+    decay = math.exp(-rate * h)
+    left = state.transient * decay
+    if h <= _LATE * design.step_s or not droop.tau.size:
+        return left
+    before = state.injection_error.input
+    change = np.abs(droop(droop.vbar**2 - given) - droop(droop.vbar**2 - before))
+    unknown = np.minimum((1.0 - decay) / (rate * droop.tau) * change, 2.0 * droop.limit)
+    effect = np.abs(design.sensitivities.columns(Power.REACTIVE, droop.customer)[design.prior.meters])
+    return np.minimum(left + effect @ unknown, design.inverter_reach)
 
 
 def _powers(
