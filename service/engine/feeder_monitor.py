@@ -108,7 +108,7 @@ class Suspicions:
 
 HANDOVER_S = 3.0
 """Least time from a stored observer to the first tick of the next owner, s."""
-RECORDS = 4
+RECORDS = 3
 """Stored observers per settling time."""
 
 

@@ -83,6 +83,9 @@ _PAUSE = 60.0
 _LATE = 1.5
 """Ticks after the last frame from which on the voltages may have moved unseen."""
 
+_RESPONSES = 4
+"""Iterations for the inverters' response in a pause; each divides the excess by the loop gain."""
+
 
 _RENEW_TICKS, _RENEW_RATIO, _LEAST_SWING = 16, 1.1, 0.01
 """Renewal of the model error: ticks, ratio of the largest voltage change, and least change, squared pu."""
@@ -365,21 +368,39 @@ def predict(
 def _transient(design: SequentialDesign, state: SequentialState, given: Floats, frame: Frame) -> Floats:
     """Remainder of unknown injections in the squared voltages of the meters, (p,).
 
-        u' = -rate u + |2 X| |K(z) - K(z_before)| / tau
+        u' = -rate u + |2 X| |K(z) - K(z_end)| / tau
 
-    The second term counts after a pause of the frames only. The observer is driven by the voltages at its
-    end, `given` (m,), squared pu. The true voltages are between these and those before the pause.
+    The second term counts in a pause of the frames only. The observer is driven by the voltages at its end,
+    `given` (m,), squared pu.
     """
     rate, h, droop = design.certificate.rate, frame.t - state.t, design.plant.droop
     decay = math.exp(-rate * h)
     left = state.transient * decay
     if h <= _LATE * design.step_s or not droop.tau.size:
         return left
-    before = state.injection_error.input
-    change = np.abs(droop(droop.vbar**2 - given) - droop(droop.vbar**2 - before))
+    change = _unseen(design, state, given)
     unknown = np.minimum((1.0 - decay) / (rate * droop.tau) * change, 2.0 * droop.limit)
     effect = np.abs(design.sensitivities.columns(Power.REACTIVE, droop.customer)[design.prior.meters])
     return np.minimum(left + effect @ unknown, design.inverter_reach)
+
+
+def _unseen(design: SequentialDesign, state: SequentialState, given: Floats) -> Floats:
+    """Range of the set-points in a pause, (m,), pu: ``K(z_high) - K(z_low)``.
+
+    Assumption: loads and busbar keep the voltages between those before and after the pause, `given` (m,),
+    squared pu. The inverters' own response adds ``|H| (range of x)``. The map is monotone: from above, its
+    images stay above that range.
+    """
+    droop, x = design.plant.droop, state.x
+    assert x is not None  # noqa: S101  # before the first frame there is no pause
+    ends = droop.vbar**2 - np.stack([given, state.injection_error.input])
+    z, moved, response = (ends.min(axis=0), ends.max(axis=0)), droop.span, np.abs(design.loop)
+    low = high = x
+    for _ in range(_RESPONSES):
+        more = response @ moved
+        low, high = droop(z[0] - more), droop(z[1] + more)
+        moved = np.maximum(high, x) - np.minimum(low, x)
+    return np.asarray(high - low)
 
 
 def _powers(
