@@ -23,6 +23,8 @@ from tests.service.running import until
 
 OUTAGE_S = 30.0
 """Time for which PostgreSQL is stopped, s."""
+START_S = 180.0
+"""Time limit until a started worker has feeders, s: for a busy machine."""
 KIND = "meter-manipulated"
 
 
@@ -178,7 +180,7 @@ class Trial:
                 process.end()
                 self.live.start_worker(name)
         wanted = set(self.live.workers)
-        until(lambda: set(self.live.owners().values()) == wanted, "the distribution", 60.0)
+        until(lambda: set(self.live.owners().values()) == wanted, "the distribution", START_S)
 
     def check(self, fault: Fault) -> None:
         """Compare the alarms with the manipulated meters."""
