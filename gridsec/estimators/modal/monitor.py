@@ -851,4 +851,5 @@ def observed(design: ModalDesign, state: ModalState) -> ObserverRecord | None:
 
 def resume(design: ModalDesign, state: ModalState, before: ObserverRecord) -> ModalState:
     """State from `init` with the observer of an earlier run, as of the default estimator."""
-    return replace(state, front=front_state.resume(design.front, state.front, before))
+    front = front_state.resume(design.front, state.front, before)
+    return state if front is state.front else replace(state, front=front)
