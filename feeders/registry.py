@@ -38,7 +38,7 @@ from gridsec.estimators import (
 )
 from gridsec.estimators.exact_bank.bank import MOST_OBSERVERS, Gains
 from gridsec.estimators.modal import monitor as modal
-from gridsec.estimators.sequential import Commission, LearningProgress, SuspicionRecord
+from gridsec.estimators.sequential import Commission, LearningProgress, ObserverRecord, SuspicionRecord
 from gridsec.estimators.sequential.search import Decoder
 from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.certificates import certify
@@ -60,6 +60,7 @@ __all__ = [
     "DesignedEstimator",
     "Estimator",
     "EstimatorUnusable",
+    "ObserverMemory",
     "WarmStart",
     "bank_gains",
     "cache_folder",
@@ -109,6 +110,18 @@ class WarmStart:
 
 
 @dataclass(frozen=True, slots=True)
+class ObserverMemory:
+    """Functions of an estimator that continues its observer of the inverters after a restart."""
+
+    settling_s: Callable[[Any], float]  # `settling_s(design)`: time of a start without a record, s
+    # `observed(design, state)`: present observer; None if a start without it is as good
+    observed: Callable[[Any, Any], ObserverRecord | None]
+    # `resume(design, state, record)`: state from `init` at the time of the first frame, with this observer;
+    # the same state if the record is too old
+    resume: Callable[[Any, Any, ObserverRecord], Any]
+
+
+@dataclass(frozen=True, slots=True)
 class Estimator:
     """Estimator: three functions, a name, and optional abilities."""
 
@@ -126,6 +139,7 @@ class Estimator:
     withstands: Callable[[Any], int] | None = None
     bias_learning: BiasLearning | None = None  # learning of the meters' fixed errors; None without it
     warm_start: WarmStart | None = None  # restoring of suspects after a restart; None without it
+    observer_memory: ObserverMemory | None = None  # the same for the observer of the inverters
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -557,6 +571,7 @@ FAMILIES: Final = Families(
                 progress=sequential.progress,
             ),
             warm_start=WarmStart(sequential.distrusted, sequential.warm_start),
+            observer_memory=ObserverMemory(sequential.settling_s, sequential.observed, sequential.resume),
         ),
         replace(
             _of(
@@ -576,6 +591,9 @@ FAMILIES: Final = Families(
                 progress=modal.progress,
             ),
             warm_start=WarmStart(modal.distrusted, modal.warm_start),
+            observer_memory=ObserverMemory(
+                lambda d: sequential.settling_s(d.front), modal.observed, modal.resume
+            ),
         ),
         _of(exact_bank, DIRECT, "banks of circle-criterion observers, direct injection (chong2020)"),
         _of(exact_bank, LMI, "the same banks, gains by matrix inequality (chong2020)", design=_lmi_bank),

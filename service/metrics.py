@@ -59,6 +59,11 @@ class Metrics:
         counter, gauge = partial(Counter, registry=registry), partial(Gauge, registry=registry)
         self.ticks = counter("gridsec_ticks", "Ticks, by verdict.", ["feeder", "verdict"])
         self.skipped = counter("gridsec_ticks_skipped", "Skipped ticks.", ["feeder"])
+        self.observers = counter(
+            "gridsec_observer_starts",
+            "Starts of a feeder's observer of inverters, by its stored state: resumed, old, refused, new.",
+            ["feeder", "state"],
+        )
         self.seen = gauge("gridsec_meters_seen", "Available meters at the latest tick.", ["feeder"])
         self.suspects = gauge("gridsec_suspects", "Suspects at the latest tick.", ["feeder"])
         self.learned = gauge("gridsec_meters_learned", "Meters with a learned fixed error.", ["feeder"])

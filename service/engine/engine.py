@@ -39,8 +39,13 @@ from service.alarms.state_machine import (
     restore,
 )
 from service.alarms.state_machine import to_json as alarm_json
-from service.engine.commissioning import CommissioningProgress, FeederCommissioning
-from service.engine.feeder_monitor import FeederMonitor, Suspicions, TickResult, align_rules, known_of
+from service.engine.commissioning import CommissioningProgress
+from service.engine.feeder_monitor import (
+    FeederMonitor,
+    TickResult,
+    align_rules,
+    known_of,
+)
 from service.engine.load import FeederLoad, LoadControl
 from service.engine.operators import SHELVE_MOST_S, Operators
 from service.engine.orphans import Orphans, Standing, read_standing
@@ -57,7 +62,7 @@ from service.store import Rejected, Store
 from service.store.committer import Committer, Executor, Wish, alarm_key, incident_key, inline
 from service.store.schema import CommissioningEvent
 from service.store.series import Mark, mark, worth_keeping
-from service.store.state_codec import KeptInvalid, StateSnapshot, decode_signed, encode_signed
+from service.store.state_codec import KeptInvalid, MonitorState, StateSnapshot, decode_signed, encode_signed
 
 BAD_PER_SOURCE = 5
 """Bad readings of one round, key and reason that are stored separately; the others become one entry."""
@@ -218,11 +223,10 @@ class Handover:
 
 @dataclass(frozen=True, slots=True)
 class PersistedState:
-    """State of a feeder for the warm start: alarms, commissioning, suspicions, order of signed readings."""
+    """State of a feeder for the warm start: alarms, state of the monitor, order of signed readings."""
 
     alarms: tuple[Alarm, ...]
-    commission: StateSnapshot | None
-    distrust: StateSnapshot | None
+    monitor: MonitorState
     signed: StateSnapshot | None = None
 
 
@@ -282,9 +286,7 @@ class Engine:
             site, config.clock, max_skew_s=config.max_skew_s, grace_s=config.grace_s, live=True
         )
         book = restore(name, past.alarms)
-        monitor = FeederMonitor(
-            site, rules, book, FeederCommissioning(site, past.commission), Suspicions(site, past.distrust)
-        )
+        monitor = FeederMonitor(site, rules, book, past.monitor)
         held = {alarm.id for alarm in book.alarms}
         twice = [alarm for alarm in past.alarms if alarm.id not in held]
         self.committer.waiting.add(transitions=close(twice, self._wall(), TOLD_TWICE))
@@ -316,7 +318,8 @@ class Engine:
         latest = min([self._wall(), *(tick["t"] for tick in store.history(name, limit=1))])
         alarms = store.active(name, cleared_since=latest - AlarmRules().memory_s)
         signed = None if self.config.meter_keys is None else store.signed(name)
-        return PersistedState(tuple(alarms), store.commission(name), store.distrust(name), signed)
+        state = MonitorState(store.commission(name), store.distrust(name), store.observer(name))
+        return PersistedState(tuple(alarms), state, signed)
 
     def put(
         self, site: Site, tables: Mapping[str, Any], installed: Callable[[FeederMonitor], None]
@@ -344,12 +347,7 @@ class Engine:
         monitor = self.monitors.get(name)
         if monitor is None:
             return stored
-        return PersistedState(
-            monitor.book.alarms,
-            monitor.commissioning.now() or stored.commission,
-            monitor.suspicions.now() or stored.distrust,
-            stored.signed,
-        )
+        return PersistedState(monitor.book.alarms, monitor.now(stored.monitor), stored.signed)
 
     def remove(self, name: str) -> Future[None]:
         """Stop monitoring a feeder: its alarms are cleared, its tables deleted, its history stays.
@@ -529,6 +527,7 @@ class Engine:
             self.metrics.count_tick(result.state, len(monitor.book.active))
             self.reported[monitor.name] = time.monotonic()
             self.keep_states((monitor,))
+            self._count_start(monitor)
         self.committer.commit()
         self._publish_estimates(results)
         lasted = time.perf_counter() - started
@@ -665,14 +664,15 @@ class Engine:
         return results
 
     def keep_states(self, monitors: Iterable[FeederMonitor] | None = None, *, at_once: bool = False) -> None:
-        """Queue the commissioning and the suspicions of feeders for the database, if they are due.
+        """Queue the commissioning, suspicions and observers of feeders for the database, if they are due.
 
-        `monitors` None: all. With `at_once` it includes a commissioning that is not due yet.
+        `monitors` None: all. With `at_once` it includes those that are not due yet.
         """
         self._keep_order(at_once=at_once)
         for monitor in self.monitors.values() if monitors is None else monitors:
             kept, happened = monitor.commissioning.due(at_once=at_once)
-            self.committer.waiting.add(kept=(*kept, *monitor.suspicions.due()), happened=happened)
+            kept = (*kept, *monitor.suspicions.due(), *monitor.observer.due(at_once=at_once))
+            self.committer.waiting.add(kept=kept, happened=happened)
             for one in happened:
                 _say(one)
             if happened:
@@ -691,6 +691,15 @@ class Engine:
         known = monitor.commissioning.known
         if known is not None:
             self.metrics.learned.labels(monitor.name).set(np.isfinite(known.learned.at).sum())
+
+    def _count_start(self, monitor: FeederMonitor) -> None:
+        """Count and log the start of an observer."""
+        observer, started = monitor.observer, monitor.observer.started
+        if started is None:
+            return
+        observer.started = None
+        self.metrics.observers.labels(monitor.name, started).inc()
+        _log.info("the observer starts", feeder=monitor.name, state=started, problem=observer.note or None)
 
     def _guarded(self, monitor: FeederMonitor, run: Callable[[], T]) -> T | None:
         """Run a step of one feeder; a defect stops this feeder, visibly, and no other."""

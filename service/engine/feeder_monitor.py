@@ -20,7 +20,7 @@ import numpy as np
 
 from feeders import registry
 from feeders.model.site import PowerAges, Site, to_frame
-from feeders.registry import DesignedEstimator, WarmStart
+from feeders.registry import DesignedEstimator, ObserverMemory, WarmStart
 from gridsec.estimators.sequential import SuspicionRecord
 from gridsec.interface import Cause
 from service.alarms import displayed
@@ -33,7 +33,16 @@ from service.report import feeder_info
 from service.report.data_errors import DataErrors
 from service.report.report import BUSBAR, FeederReport, busbar_phases, snapshot
 from service.report.tick_state import TickState
-from service.store.state_codec import KeptInvalid, StateSnapshot, decode_distrust, encode_distrust
+from service.store.state_codec import (
+    KeptInvalid,
+    MonitorState,
+    StateSnapshot,
+    decode_distrust,
+    decode_observer,
+    encode_distrust,
+    encode_observer,
+    observer_fingerprint,
+)
 
 
 class Suspicions:
@@ -92,6 +101,94 @@ class Suspicions:
             return ()
         self._stored = self.known
         return (encode_distrust(self._site, self._t, self.known),)
+
+
+# --- Observer of one feeder ---
+
+
+HANDOVER_S = 3.0
+"""Least time from a stored observer to the first tick of the next owner, s."""
+RECORDS = 3
+"""Stored observers per settling time."""
+
+
+class ObserverStart(StrEnum):
+    """Start of an observer."""
+
+    RESUMED = "resumed"  # from the stored state
+    OLD = "old"  # the stored state is too old
+    REFUSED = "refused"  # the stored state is damaged, or of another feeder or version
+    NEW = "new"  # without stored state
+
+
+class ObserverHandover:
+    """Observer of one feeder across restarts.
+
+    note: reason why stored state is not used; empty otherwise.
+    started: the latest start of the observer, until it is counted; None without one.
+    kept: stored state.
+    """
+
+    def __init__(self, site: Site, kept: StateSnapshot | None = None) -> None:
+        self.note = ""
+        self.started: ObserverStart | None = None
+        self._site, self._kept, self._fingerprint = site, kept, observer_fingerprint(site)
+        self._watcher: DesignedEstimator | None = None
+        self._memory: ObserverMemory | None = None
+        self._every_s = math.inf
+        self._state: Any = None
+        self._t = self._stored_t = -math.inf
+
+    def install(self, watcher: DesignedEstimator) -> None:
+        """Install a finished design."""
+        self._watcher, self._memory = watcher, watcher.family.observer_memory
+        settling_s = 0.0 if self._memory is None else self._memory.settling_s(watcher.design)
+        # A shorter start is over before a stored state could be used.
+        self._every_s = settling_s / RECORDS if settling_s >= HANDOVER_S else math.inf
+
+    def restore(self, state: Any) -> Any:
+        """Continue the stored observer in a state of `init` at the first tick, if it fits; use it once."""
+        kept, self._kept = self._kept, None
+        if self._watcher is None or self._memory is None or self._every_s == math.inf:
+            return state
+        if kept is None:
+            self.started = ObserverStart.NEW
+            return state
+        try:
+            record = decode_observer(self._site, self._fingerprint, kept)
+        except KeptInvalid as error:
+            self.started = ObserverStart.REFUSED
+            self.note = f"observer of {kept.t:.0f} is not used: {error}"
+            return state
+        after = self._memory.resume(self._watcher.design, state, record)
+        self.started = ObserverStart.OLD if after is state else ObserverStart.RESUMED
+        return after
+
+    def follow(self, state: Any, t: float) -> None:
+        """Update from the result of a tick."""
+        self._state, self._t = state, t
+
+    def now(self) -> StateSnapshot | None:
+        """Return the present state for the store; None before the first tick, and where none is needed."""
+        if self._watcher is None or self._memory is None or self._state is None:
+            return None
+        record = self._memory.observed(self._watcher.design, self._state)
+        return None if record is None else encode_observer(self._site.feeder.name, self._fingerprint, record)
+
+    def due(self, *, at_once: bool = False) -> tuple[StateSnapshot, ...]:
+        """Return the state for the store if it is due; it counts as stored afterwards.
+
+        Feeders with equal settling times are due at the same ticks: one transaction stores them. With
+        `at_once` it includes a state that is not due yet.
+        """
+        t, every_s = self._t, self._every_s
+        if t == self._stored_t or every_s == math.inf:
+            return ()
+        if not at_once and t // every_s == self._stored_t // every_s:
+            return ()
+        self._stored_t = t
+        kept = self.now()
+        return () if kept is None else (kept,)
 
 
 # --- Monitor of one feeder ---
@@ -183,25 +280,23 @@ class FeederMonitor:
     defect: error that ended the monitor, until it is logged; None without one.
     rules: times of its alignment.
     book: its alarms so far.
-    commissioning: state of the meters' errors; None for none.
-    suspicions: distrusted devices; None for none.
+    commissioning: state of the meters' errors.
+    suspicions: distrusted devices.
+    observer: observer of the inverters across restarts.
     """
 
     def __init__(
-        self,
-        site: Site,
-        rules: AlignRules,
-        book: AlarmBook,
-        commissioning: FeederCommissioning | None = None,
-        suspicions: Suspicions | None = None,
+        self, site: Site, rules: AlignRules, book: AlarmBook, past: MonitorState | None = None
     ) -> None:
+        past = past or MonitorState()
         self.site = site
         self.name = site.feeder.name
         self.max_attacked = 0  # M of the design; none is guaranteed without one
         self.aligner = Aligner(site.meter_ids, rules)
         self.book = book
-        self.commissioning = commissioning or FeederCommissioning(site)
-        self.suspicions = suspicions or Suspicions(site)
+        self.commissioning = FeederCommissioning(site, past.commission)
+        self.suspicions = Suspicions(site, past.distrust)
+        self.observer = ObserverHandover(site, past.observer)
         self.phase = Phase.DESIGNING
         self.problem = ""
         self.latest: TickState | None = None
@@ -220,6 +315,14 @@ class FeederMonitor:
         self._mismatches: dict[str, tuple[float, str]] = {}
         self._watcher: registry.DesignedEstimator | None = None
         self._state: Any = None
+
+    def now(self, stored: MonitorState) -> MonitorState:
+        """Return the present state for the store, with `stored` where there is none yet."""
+        return MonitorState(
+            self.commissioning.now() or stored.commission,
+            self.suspicions.now() or stored.distrust,
+            self.observer.now() or stored.observer,
+        )
 
     @property
     def report(self) -> FeederReport | None:
@@ -245,6 +348,7 @@ class FeederMonitor:
         self.max_attacked = finished.max_attacked
         self.commissioning.install(finished)
         self.suspicions.install(finished)
+        self.observer.install(finished)
         self.phase, self.problem = Phase.WATCHING, ""
 
     def fail(self, problem: str) -> None:
@@ -409,13 +513,14 @@ class FeederMonitor:
         if self._state is None or (self.latest is not None and tick.t <= self.latest.t):
             # The first tick, or the clock was set back: earlier readings belong to another time.
             begun = self._watcher.init(tick.t, self.commissioning.known)
-            self._state = self.suspicions.restore(begun)
+            self._state = self.suspicions.restore(self.observer.restore(begun))
             self._data_errors.renew()
             self._power_ages = PowerAges(self.site)
         frame = to_frame(self.site, self._power_ages.apply(snapshot(self.site, tick)))
         self._state, estimate, verdict = self._watcher.step(self._state, frame)
         self.commissioning.follow(self._state, tick.t)
         self.suspicions.follow(self._state, tick.t)
+        self.observer.follow(self._state, tick.t)
         return TickState(
             self.site,
             tick,

@@ -11,11 +11,10 @@ from feeders.simulation.plant import BUSBAR
 from feeders.simulation.scenario import SimulatedReading as Recorded
 from gridsec.interface import Decision
 from service.alarms.state_machine import AlarmBook
-from service.engine.commissioning import FeederCommissioning
-from service.engine.feeder_monitor import FeederMonitor, Suspicions, TickResult, align_rules, design, known_of
+from service.engine.feeder_monitor import FeederMonitor, TickResult, align_rules, design, known_of
 from service.ingest.align import Clock, ReadingOutcome
 from service.ingest.reading import T_MAX, T_MIN, BadReason, Findings, Known, Reading, judge, to_reading
-from service.store.state_codec import StateSnapshot
+from service.store.state_codec import MonitorState, StateSnapshot
 
 
 @dataclass(slots=True)
@@ -43,6 +42,7 @@ def replay(
     grace_s: float | None = None,
     kept: StateSnapshot | None = None,
     distrust: StateSnapshot | None = None,
+    observer: StateSnapshot | None = None,
     skipped: Sequence[tuple[float, float]] = (),
 ) -> Iterator[TickResult]:
     """Yield the service's results for recorded readings.
@@ -55,12 +55,13 @@ def replay(
     kept: state of the meters' errors at the start of the recording, as in `FeederCommissioning`; None for
         none.
     distrust: distrusted devices at the start, as in `Suspicions`; None for none.
+    observer: observer at the start, as in `ObserverHandover`; None for none.
     skipped: first and last Unix time of ticks that the live service skipped, s; the replay skips them, too.
     Raises NotObservable, DesignInfeasible if the feeder cannot be monitored.
     """
     rules = align_rules(site, clock, max_skew_s=max_skew_s, grace_s=grace_s)
     book = AlarmBook(site.feeder.name)
-    monitor = FeederMonitor(site, rules, book, FeederCommissioning(site, kept), Suspicions(site, distrust))
+    monitor = FeederMonitor(site, rules, book, MonitorState(kept, distrust, observer))
     monitor.install(design(site))
     known = known_of(site)
     for one in recorded:

@@ -265,7 +265,7 @@ def _of_each_feeder(name: str) -> sa.Table:
 
 
 COMMISSION, DISTRUST = _of_each_feeder("commission"), _of_each_feeder("distrust")
-SIGNED = _of_each_feeder("signed_order")
+SIGNED, OBSERVER = _of_each_feeder("signed_order"), _of_each_feeder("observer")
 COMMISSION_EVENT = sa.Table(
     "commission_event",
     META,
@@ -381,6 +381,10 @@ def _add_workers(connection: sa.Connection) -> None:
     connection.execute(FEEDER_CHANGES.insert().values(number=0))
 
 
+def _add_observer(connection: sa.Connection) -> None:
+    OBSERVER.create(connection)
+
+
 MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
     _add_commissioning,
     _add_distrust,
@@ -390,6 +394,7 @@ MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (
     _add_incidents,
     _add_signed,
     _add_workers,
+    _add_observer,
 )
 """Step k migrates schema version k + 1 to k + 2. A new database starts at the newest version.
 

@@ -1,6 +1,9 @@
-"""Versioned JSON encoding of a feeder's persistent state: commissioning, suspicions, signed readings.
+"""Versioned JSON encoding of a feeder's persistent state.
 
-Numbers are written with enough digits to restore the same float64, NaN as null.
+The subjects are commissioning, suspicions, observer and signed readings.
+
+Numbers are written with enough digits to restore the same float64, NaN as null. The observer's arrays are
+single precision, as base64.
 """
 
 from __future__ import annotations
@@ -21,7 +24,8 @@ from feeders.format.tables import to_json
 from feeders.model.site import Site
 from gridsec.arrays import Floats
 from gridsec.errors import GridsecError
-from gridsec.estimators.sequential import SuspicionRecord
+from gridsec.estimators.plant import NO_VOLTAGE
+from gridsec.estimators.sequential import ObserverRecord, SuspicionRecord
 from service.access.signing import SignedOrder
 from service.report.report import Phase, busbar_phases
 
@@ -38,6 +42,7 @@ class SnapshotKind(StrEnum):
 
     COMMISSION = "commission"
     DISTRUST = "distrust"
+    OBSERVER = "observer"
     SIGNED = "signed"
 
 
@@ -55,6 +60,15 @@ class StateSnapshot:
     t: float  # Unix time of its tick, s
     text: str  # result of `encode` or `encode_distrust`
     matter: SnapshotKind = SnapshotKind.COMMISSION  # subject of the text
+
+
+@dataclass(frozen=True, slots=True)
+class MonitorState:
+    """Stored state of a feeder's monitor, by subject; None where none is stored."""
+
+    commission: StateSnapshot | None = None
+    distrust: StateSnapshot | None = None
+    observer: StateSnapshot | None = None
 
 
 class CommissionRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -205,6 +219,60 @@ def decode_distrust(site: Site, kept: StateSnapshot) -> SuspicionRecord:
     )
 
 
+_Part: TypeAlias = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+_SINGLE: Final = 1e-6
+"""Rounding of an injection to single precision, as a part of its span; at least the true one."""
+
+
+class ObserverText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Contents of the text of an observer."""
+
+    format: int  # version of the text
+    # feeder, t: as in `StateSnapshot`.
+    feeder: str
+    t: _Finite
+    fingerprint: str  # result of `observer_fingerprint` at that time
+    x: bytes  # (m,) injections, pu, float32
+    input: bytes  # (m,) squared voltages, pu, float32
+    # error, transient: as in `ObserverRecord`.
+    error: _Part
+    transient: _Part
+
+
+def observer_fingerprint(site: Site) -> str:
+    """Return the digest of everything that an observer depends on: the feeder and its droop curves."""
+    droop = site.droop
+    curves = (droop.customer, droop.v, droop.q, droop.tau, droop.vbar)
+    return _digest([fingerprint(site), *(np.asarray(part).tolist() for part in curves)])
+
+
+def encode_observer(feeder: str, now: str, record: ObserverRecord) -> StateSnapshot:
+    """Encode an observer. `now` is the result of `observer_fingerprint`."""
+    x, given = (array.astype("<f4").tobytes() for array in (record.x, record.input))
+    error = min(record.error + _SINGLE, 1.0)
+    text = ObserverText(FORMAT, feeder, record.t, now, x, given, error, record.transient)
+    return StateSnapshot(feeder, record.t, msgspec.json.encode(text).decode(), SnapshotKind.OBSERVER)
+
+
+def decode_observer(site: Site, now: str, kept: StateSnapshot) -> ObserverRecord:
+    """Decode an observer for the present feeder.
+
+    `now` is the result of `observer_fingerprint`. Raises KeptInvalid if the text is damaged, newer than this
+    program, or of a feeder that has changed since.
+    """
+    text, droop = _read(site.feeder.name, kept, ObserverText), site.droop
+    if text.fingerprint != now:
+        raise KeptInvalid("the feeder has changed since", code="feeder-changed")
+    if {len(text.x), len(text.input)} != {4 * droop.tau.size}:
+        raise KeptInvalid("it is damaged: its arrays do not fit its inverters", code="damaged")
+    x, given = (np.frombuffer(part, dtype="<f4").astype(np.float64) for part in (text.x, text.input))
+    room = _SINGLE * droop.limit
+    possible = (x >= droop.q.min(axis=1) - room) & (x <= droop.q.max(axis=1) + room)
+    if not (possible & (given >= 0.0) & (given <= NO_VOLTAGE)).all():
+        raise KeptInvalid("it is damaged: a value is impossible", code="damaged")
+    return ObserverRecord(text.t, x, given, text.error, text.transient)
+
+
 class SignedRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Contents of the text of the newest signed readings."""
 
@@ -245,7 +313,7 @@ class _Version(msgspec.Struct, frozen=True):
     format: Annotated[int, msgspec.Meta(ge=1)]
 
 
-_Text = TypeVar("_Text", CommissionRecord, DistrustRecord, SignedRecord)
+_Text = TypeVar("_Text", CommissionRecord, DistrustRecord, ObserverText, SignedRecord)
 
 
 def _read(feeder: str, kept: StateSnapshot, kind: type[_Text]) -> _Text:

@@ -47,6 +47,7 @@ from service.store.schema import (
     HISTORY,
     INCIDENT_EVENT,
     LAYOUT,
+    OBSERVER,
     OUTBOX,
     ROLLUP,
     SIGNED,
@@ -289,6 +290,10 @@ class Reader(IncidentReader):
         """Return the stored suspicions of a feeder, or None."""
         return self._kept(DISTRUST, feeder, SnapshotKind.DISTRUST)
 
+    def observer(self, feeder: str) -> StateSnapshot | None:
+        """Return the stored observer of a feeder, or None."""
+        return self._kept(OBSERVER, feeder, SnapshotKind.OBSERVER)
+
     def signed(self, feeder: str) -> StateSnapshot | None:
         """Return the stored order of a feeder's signed readings, or None."""
         return self._kept(SIGNED, feeder, SnapshotKind.SIGNED)
@@ -357,6 +362,7 @@ _log = structlog.get_logger("gridsec.store")
 _KEPT = {
     SnapshotKind.COMMISSION: COMMISSION,
     SnapshotKind.DISTRUST: DISTRUST,
+    SnapshotKind.OBSERVER: OBSERVER,
     SnapshotKind.SIGNED: SIGNED,
 }
 
@@ -591,9 +597,9 @@ class Store(Reader):
         reports: reports of the feeders; the history selects from them.
         rejected: rejected readings; the newest `BAD_READINGS_KEPT` are kept. Readings that the database
             cannot represent are dropped and logged.
-        kept, happened: state of the feeders' commissioning, suspicions and signed readings, and changes of
-            the first.
-        without: delete the tables of this feeder, its commissioning and its suspicions.
+        kept, happened: state of the feeders' commissioning, suspicions, observers and signed readings, and
+            changes of the first.
+        without: delete the tables of this feeder, its commissioning, suspicions and observer.
         put: a feeder and the columns of its files as JSON, which replace the stored ones.
         actions: actions of operators on incidents, shelves and planned works.
         now: wall clock, Unix s, for shelves and works; None: the latest time of the transitions.
@@ -635,8 +641,7 @@ class Store(Reader):
                     self._put_history(connection, worthy, rolled)
                     if rejected:
                         _put_rejected(connection, rejected)
-                    for item in kept:
-                        self._put_kept(connection, item)
+                    self._put_kept(connection, kept)
                     if happened:
                         connection.execute(COMMISSION_EVENT.insert(), [_happened(item) for item in happened])
                     if without is not None:
@@ -750,10 +755,15 @@ class Store(Reader):
         statement = self._connections.insert(FEEDER).values(row)
         connection.execute(statement.on_conflict_do_update(index_elements=["name"], set_=row))
 
-    def _put_kept(self, connection: sa.Connection, kept: StateSnapshot) -> None:
-        row = {"feeder": kept.feeder, "t": kept.t, "data": kept.text}
-        statement = self._connections.insert(_KEPT[kept.matter]).values(row)
-        connection.execute(statement.on_conflict_do_update(index_elements=["feeder"], set_=row))
+    def _put_kept(self, connection: sa.Connection, kept: Iterable[StateSnapshot]) -> None:
+        subjects: dict[SnapshotKind, list[dict[str, Any]]] = {}
+        for item in kept:
+            row = {"feeder": item.feeder, "t": item.t, "data": item.text}
+            subjects.setdefault(item.matter, []).append(row)
+        for matter, new in subjects.items():
+            statement = self._connections.insert(_KEPT[matter])
+            columns = {name: statement.excluded[name] for name in ("t", "data")}
+            connection.execute(statement.on_conflict_do_update(index_elements=["feeder"], set_=columns), new)
 
     def _worth(self, marks: dict[str, Mark], report: FeederReport) -> bool:
         """True if a report gets a row; later ones are then compared with it."""
@@ -851,7 +861,7 @@ def _forget_feeder(connection: sa.Connection, name: str) -> None:
     _count_change(connection)
     connection.execute(FEEDER.delete().where(FEEDER.c.name == name))
     # The order of signed readings stays: a feeder that is put again must not accept a repetition.
-    for table in (COMMISSION, DISTRUST):
+    for table in (COMMISSION, DISTRUST, OBSERVER):
         connection.execute(table.delete().where(table.c.feeder == name))
 
 

@@ -265,7 +265,17 @@ class ServedCluster:
 class Writes:
     """Record of all changes of a database, by triggers: worker and time of each."""
 
-    TABLES = ("alarm", "event", "outbox", "history", "incident", "incident_event", "commission", "distrust")
+    TABLES = (
+        "alarm",
+        "event",
+        "outbox",
+        "history",
+        "incident",
+        "incident_event",
+        "commission",
+        "distrust",
+        "observer",
+    )
 
     def __init__(self, database: str) -> None:
         self.address = database.replace("+psycopg", "")

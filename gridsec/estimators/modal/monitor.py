@@ -76,7 +76,12 @@ from gridsec.estimators.sequential.meter_bias import (
 )
 from gridsec.estimators.sequential.output import BoundInputs
 from gridsec.estimators.sequential.posterior import UNMETERED, LoadDoubt
-from gridsec.estimators.sequential.state import Prediction, SequentialState, SuspicionRecord
+from gridsec.estimators.sequential.state import (
+    ObserverRecord,
+    Prediction,
+    SequentialState,
+    SuspicionRecord,
+)
 from gridsec.estimators.sequential.step import predict
 from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.certificates import Certificate
@@ -493,9 +498,9 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         trust,
         t=tick.measured.frame.t,
         frame=tick.measured.frame,
-        since=tick.measured.frame.t if now.x is None else now.since,
         ticks=now.ticks + 1,
         x=tick.predicted.x,
+        transient=tick.predicted.transient,
         model_driven=tick.predicted.model_driven,
         injection_error=_injection_error(front, now, tick, trust.trust.trusted),
         inverter_checks=checks,
@@ -834,3 +839,17 @@ def warm_start(design: ModalDesign, state: ModalState, before: SuspicionRecord) 
         front=front,
         core=replace(state.core, masked=masking.added(state.core.masked, ~front.trust.trusted)),
     )
+
+
+# --- Observer over a restart ---
+
+
+def observed(design: ModalDesign, state: ModalState) -> ObserverRecord | None:
+    """Observer of a state, as of the default estimator."""
+    return front_state.observed(design.front, state.front)
+
+
+def resume(design: ModalDesign, state: ModalState, before: ObserverRecord) -> ModalState:
+    """State from `init` with the observer of an earlier run, as of the default estimator."""
+    front = front_state.resume(design.front, state.front, before)
+    return state if front is state.front else replace(state, front=front)

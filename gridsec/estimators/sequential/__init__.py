@@ -35,11 +35,15 @@ from gridsec.estimators.sequential.meter_bias import (
 )
 from gridsec.estimators.sequential.posterior import LoadDoubt
 from gridsec.estimators.sequential.state import (
+    ObserverRecord,
     SequentialState,
     SuspicionRecord,
     distrusted,
     init,
+    observed,
     renew,
+    resume,
+    settling_s,
     warm_start,
 )
 from gridsec.estimators.sequential.step import step
@@ -51,6 +55,7 @@ __all__ = [
     "LearningReason",
     "LearningState",
     "LoadDoubt",
+    "ObserverRecord",
     "SequentialDesign",
     "SequentialOptions",
     "SequentialState",
@@ -59,8 +64,11 @@ __all__ = [
     "distrusted",
     "from_arrays",
     "init",
+    "observed",
     "progress",
     "renew",
+    "resume",
+    "settling_s",
     "step",
     "to_arrays",
     "warm_start",

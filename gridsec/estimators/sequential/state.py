@@ -212,7 +212,7 @@ class Prediction:
     injection_error: InjectionError  # errors of the injections
     powers: PowerErrors  # net injections of the model, and their errors
     v2_bus: Floats  # (n,) squared voltages, pu
-    transient: Floats  # (p,) remainder of the unknown initial state, squared pu
+    transient: Floats  # (p,) remainder of unknown injections, squared pu
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,9 +221,9 @@ class SequentialState:
 
     t: float  # time of the last frame used, s
     frame: Frame | None  # last frame used; None before the first
-    since: float  # time of the first frame used, s
     ticks: int  # frames used
     x: Floats | None  # (m,) injections, pu; None before the first frame
+    transient: Floats  # (p,) remainder of unknown injections in the squared voltages of the meters, pu
     model_driven: ModelDriven | None  # prepared loop of the inverters without a trusted meter
     injection_error: InjectionError  # errors of the injections
     v0_squared: Floats | float  # last trusted squared busbar voltage, pu; (3,) in three phases
@@ -266,9 +266,9 @@ def init(
     return SequentialState(
         t=t,
         frame=None,
-        since=t,
         ticks=0,
         x=None,
+        transient=design.inverter_reach,
         model_driven=None,
         injection_error=unknown_injections(design.plant, np.zeros(m)),
         v0_squared=design.plant.droop.vbar**2,
@@ -306,6 +306,60 @@ def renew(design: SequentialDesign, state: SequentialState, which: Bools) -> Seq
         attack_kinds=replace(state.attack_kinds, history=forget_readings(state.attack_kinds.history, which)),
         trust=state.trust.replaced(which),
     )
+
+
+# --- Record of the observer that survives a restart ---
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObserverRecord:
+    """Observer of the inverters after a frame. m inverters."""
+
+    t: float  # time of the frame, s
+    x: Floats  # (m,) injections, pu
+    input: Floats  # (m,) squared voltage at each inverter, pu
+    error: float  # largest error of an injection, as a part of its span
+    transient: float  # largest remainder of unknown injections, as a part of their whole effect on a meter
+
+
+def observed(design: SequentialDesign, state: SequentialState) -> ObserverRecord | None:
+    """Observer of a state; None before the first frame, and where no inverter moves a meter."""
+    reach, before = design.inverter_reach, state.injection_error
+    if state.x is None or not any_of(reach > 0.0):
+        return None
+    error = np.divide(before.error, before.span, out=np.zeros_like(before.span), where=before.span > 0.0)
+    left = np.divide(state.transient, reach, out=np.zeros_like(reach), where=reach > 0.0)
+    return ObserverRecord(
+        state.t, state.x, before.input, min(float(error.max()), 1.0), min(float(left.max()), 1.0)
+    )
+
+
+def resume(design: SequentialDesign, state: SequentialState, before: ObserverRecord) -> SequentialState:
+    """State from `init` with the observer of an earlier run; the same state if the record is too old.
+
+    The time since the record is a pause, and ends with the first frame. Nothing is assumed about the voltages
+    in it: until then the errors of the injections approach their spans. `step` adds the effect of the change
+    of the voltages to the transient, so that the verdict stays UNDECIDED where it matters.
+
+    A record is too old after `settling_s`, when the inverters have forgotten it, and unless it precedes
+    `state.t`, the time of the first frame.
+    """
+    if not 0.0 < state.t - before.t <= settling_s(design):
+        return state
+    span = design.plant.droop.span
+    unknown = np.full(span.size, NO_VOLTAGE)
+    return replace(
+        state,
+        t=before.t,
+        x=before.x,
+        injection_error=InjectionError(before.error * span, before.input, unknown, span),
+        transient=before.transient * design.inverter_reach,
+    )
+
+
+def settling_s(design: SequentialDesign) -> float:
+    """Time until unknown injections are negligible at every meter within its class, s; whole ticks."""
+    return float(_ticks_to_settle(design, design.allowed).max(initial=0)) * design.step_s
 
 
 # --- Record of suspects that survives a restart ---
@@ -389,7 +443,7 @@ def warm_start(design: SequentialDesign, state: SequentialState, before: Suspici
     scale = _closest(design, before.scale_s)
     need, settling = (
         np.array([min_readings(design, s) for s in range(len(design.lengths))]),
-        _settling(design, state),
+        _ticks_to_settle(design, state.learned.allowed),
     )
     still = trust.above_release_limit.copy()
     still[scale[which], np.flatnonzero(which)] = True
@@ -440,9 +494,9 @@ def _closest(design: SequentialDesign, scale_s: Floats) -> Ints:
     return np.asarray(far.argmin(axis=1))
 
 
-def _settling(design: SequentialDesign, state: SequentialState) -> Ints:
-    """Ticks until the unknown initial state is negligible at each meter, (p,)."""
-    least = design.options.settled * np.maximum(state.learned.allowed, np.finfo(np.float64).tiny)
+def _ticks_to_settle(design: SequentialDesign, allowed: Floats) -> Ints:
+    """Ticks until unknown injections are negligible beside the `allowed` errors of the meters, (p,)."""
+    least = design.options.settled * np.maximum(allowed, np.finfo(np.float64).tiny)
     more = np.log(np.maximum(design.inverter_reach / least, 1.0))
     rate = design.certificate.rate * design.step_s
     return np.asarray(np.where(more > 0.0, np.ceil(more / rate), 0.0)).astype(np.intp)

@@ -19,6 +19,7 @@ between its values at two successive frames (docs/theory-detection.md for the la
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 
@@ -68,6 +69,7 @@ from gridsec.estimators.sequential.state import (
     unknown_injections,
 )
 from gridsec.estimators.sequential.time_scales import Scales, Window, empty, forget, min_readings, push, shift
+from gridsec.grid.network import Power
 from gridsec.interface import Estimate, Explanation, Frame, Verdict
 from gridsec.observers.lure import POLICY, Lure, transition
 from gridsec.observers.lure import advance as advance_loop
@@ -77,6 +79,12 @@ _PATIENT = replace(POLICY, settled=0.0)
 
 _PAUSE = 60.0
 """Ticks without a frame that count as a pause."""
+
+_LATE = 1.5
+"""Ticks after the last frame from which on the voltages may have moved unseen."""
+
+_RESPONSES = 4
+"""Iterations for the inverters' response in a pause; each divides the excess by the loop gain."""
 
 
 _RENEW_TICKS, _RENEW_RATIO, _LEAST_SWING = 16, 1.1, 0.01
@@ -259,9 +267,9 @@ def _state(  # noqa: PLR0917
         now,
         t=frame.t,
         frame=frame,
-        since=frame.t if state.x is None else state.since,
         ticks=state.ticks + 1,
         x=predicted.x,
+        transient=predicted.transient,
         model_driven=model_driven,
         injection_error=error,
         v0_squared=measured.v0_squared,
@@ -353,11 +361,46 @@ def predict(
     """Prediction of a frame, with the sizes (k,) of false powers."""
     x, model_driven, error = _inverters(design, state, measured, sizes)
     powers = _powers(design, state, measured, x, sizes)
-    age = 0.0 if state.x is None else measured.frame.t - state.since
-    # Without inverters the rate is infinite; infinity times zero is NaN.
-    decay = np.exp(-design.certificate.rate * age) if age > 0 else 1.0
-    transient = np.asarray(design.inverter_reach * decay)
+    transient = state.transient if state.x is None else _transient(design, state, error.input, measured.frame)
     return Prediction(x, model_driven, error, powers, _voltages(design, powers), transient)
+
+
+def _transient(design: SequentialDesign, state: SequentialState, given: Floats, frame: Frame) -> Floats:
+    """Remainder of unknown injections in the squared voltages of the meters, (p,).
+
+        u' = -rate u + |2 X| |K(z) - K(z_end)| / tau
+
+    The second term counts in a pause of the frames only. The observer is driven by the voltages at its end,
+    `given` (m,), squared pu.
+    """
+    rate, h, droop = design.certificate.rate, frame.t - state.t, design.plant.droop
+    decay = math.exp(-rate * h)
+    left = state.transient * decay
+    if h <= _LATE * design.step_s or not droop.tau.size:
+        return left
+    change = _unseen(design, state, given)
+    unknown = np.minimum((1.0 - decay) / (rate * droop.tau) * change, 2.0 * droop.limit)
+    effect = np.abs(design.sensitivities.columns(Power.REACTIVE, droop.customer)[design.prior.meters])
+    return np.minimum(left + effect @ unknown, design.inverter_reach)
+
+
+def _unseen(design: SequentialDesign, state: SequentialState, given: Floats) -> Floats:
+    """Range of the set-points in a pause, (m,), pu: ``K(z_high) - K(z_low)``.
+
+    Assumption: loads and busbar keep the voltages between those before and after the pause, `given` (m,),
+    squared pu. The inverters' own response adds ``|H| (range of x)``. The map is monotone: from above, its
+    images stay above that range.
+    """
+    droop, x = design.plant.droop, state.x
+    assert x is not None  # noqa: S101  # before the first frame there is no pause
+    ends = droop.vbar**2 - np.stack([given, state.injection_error.input])
+    z, moved, response = (ends.min(axis=0), ends.max(axis=0)), droop.span, np.abs(design.loop)
+    low = high = x
+    for _ in range(_RESPONSES):
+        more = response @ moved
+        low, high = droop(z[0] - more), droop(z[1] + more)
+        moved = np.maximum(high, x) - np.minimum(low, x)
+    return np.asarray(high - low)
 
 
 def _powers(

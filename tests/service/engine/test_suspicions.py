@@ -237,9 +237,10 @@ def test_a_replay_with_what_was_kept_is_what_the_restarted_service_said(
     later = [r for r in lying if START + END <= r.t < START + END + 20]
     with Store(f"sqlite:///{left}") as store:
         kept, distrust = store.commission(FEEDER), store.distrust(FEEDER)
+        observer = store.observer(FEEDER)
         live, told = watching(store, site)
         feed(live, samples(later, END, END + 20))
-    results = replay(site, later, ReplayCounts(), kept=kept, distrust=distrust)
+    results = replay(site, later, ReplayCounts(), kept=kept, distrust=distrust, observer=observer)
     said = [json.loads(json.dumps(to_json(result.report))) for result in results]
     assert len(told.estimates) >= 18
     assert said[: len(told.estimates)] == told.estimates

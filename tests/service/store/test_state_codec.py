@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from copy import copy
 from dataclasses import replace
 from typing import Any
 
@@ -10,16 +11,20 @@ import numpy as np
 import pytest
 
 from feeders.model.site import Site, from_tables, load
-from gridsec.estimators.sequential import SuspicionRecord
+from gridsec.estimators.sequential import ObserverRecord, SuspicionRecord
 from service.store.state_codec import (
     FORMAT,
     KeptInvalid,
+    SnapshotKind,
     StateSnapshot,
     decode,
     decode_distrust,
+    decode_observer,
     encode,
     encode_distrust,
+    encode_observer,
     fingerprint,
+    observer_fingerprint,
 )
 from tests.codes import refused
 from tests.service.running import FEEDER
@@ -104,3 +109,63 @@ def test_who_is_not_believed_comes_back_by_name(site: Site) -> None:
         with refused(KeptInvalid, code) as caught:
             decode_distrust(site, bad)
         assert field in str(caught.value)
+
+
+def _observer(site: Site) -> ObserverRecord:
+    """An observer with some inverters at the ends of their curves."""
+    droop, rng = site.droop, np.random.default_rng(1)
+    part = np.where(np.arange(droop.tau.size) % 3, rng.uniform(0.0, 1.0, droop.tau.size), 1.0)
+    x = droop.q[:, 3] + part * droop.span
+    return ObserverRecord(START, x, rng.uniform(0.8, 1.2, x.size), 0.1 + 0.2, 1e-300)
+
+
+def test_an_observer_comes_back_in_single_precision(site: Site) -> None:
+    before, now = _observer(site), observer_fingerprint(site)
+    kept = encode_observer(FEEDER, now, before)
+    assert (kept.feeder, kept.t, kept.matter) == (FEEDER, START, SnapshotKind.OBSERVER)
+    after = decode_observer(site, now, kept)
+    np.testing.assert_allclose(after.x, before.x, rtol=1e-7)
+    np.testing.assert_allclose(after.input, before.input, rtol=1e-7)
+    assert (after.t, after.transient) == (before.t, before.transient)
+    # The error covers the rounding.
+    assert (np.abs(after.x - before.x) <= (after.error - before.error) * site.droop.span).all()
+    assert decode_observer(site, now, encode_observer(FEEDER, now, replace(before, error=1.0))).error == 1.0
+    # 146 inverters fit into a page of PostgreSQL without compression.
+    wide = replace(before, x=np.zeros(146), input=np.zeros(146))
+    assert len(encode_observer(FEEDER, now, wide).text) < 2000
+
+
+def test_damaged_newer_or_foreign_observers_are_refused(site: Site) -> None:
+    before, now = _observer(site), observer_fingerprint(site)
+    kept, least = encode_observer(FEEDER, now, before), site.droop.q[:, 3]
+
+    def with_arrays(**changes: Any) -> StateSnapshot:
+        return encode_observer(FEEDER, now, replace(before, **changes))
+
+    for bad, code, field in (
+        (replace(kept, text=kept.text[:-9]), "damaged", ""),
+        (_damaged(kept, format=FORMAT + 1), "newer-format", f" {FORMAT + 1}; "),
+        (_damaged(kept, feeder="other"), "other-feeder", "'other'"),
+        (_damaged(kept, fingerprint="0"), "feeder-changed", ""),
+        (_damaged(kept, x="AAAA"), "damaged", "inverters"),
+        (_damaged(kept, x="?"), "damaged", "$.x"),
+        (_damaged(kept, error=1.5), "damaged", "$.error"),
+        (_damaged(kept, transient=-0.1), "damaged", "$.transient"),
+        (with_arrays(x=np.full_like(before.x, np.nan)), "damaged", "impossible"),
+        (with_arrays(x=least - 0.01 * site.droop.limit), "damaged", "impossible"),
+        (with_arrays(input=np.full_like(before.x, np.inf)), "damaged", "impossible"),
+        (with_arrays(input=np.full_like(before.x, -0.1)), "damaged", "impossible"),
+    ):
+        with refused(KeptInvalid, code) as caught:
+            decode_observer(site, now, bad)
+        assert field in str(caught.value)
+
+
+def test_an_observer_belongs_to_its_droop_curves(site: Site) -> None:
+    """Another program may have other presets with the same tables."""
+    other, meta = copy(site), site.tables.meta
+    object.__setattr__(other, "droop", replace(site.droop, tau=2.0 * site.droop.tau))
+    assert fingerprint(other) == fingerprint(site)
+    assert observer_fingerprint(other) != observer_fingerprint(site)
+    titled = from_tables(replace(site.tables, meta=replace(meta, title="Another title")))
+    assert observer_fingerprint(titled) == observer_fingerprint(site)
