@@ -39,14 +39,17 @@ JUDGING = {"agreement", "residuals", "settling", "ambiguous", "misfit", "too-man
 
 
 class Fleet(threading.Thread):
-    """All meters of feeders with the tables of one site, one reading per second, by the wall clock."""
+    """All meters of feeders with the tables of one site, one reading per second, by the wall clock.
 
-    def __init__(self, zenoh: str, site: Site, names: list[str]) -> None:
+    period_s: time after which the simulated readings repeat, s.
+    """
+
+    def __init__(self, zenoh: str, site: Site, names: list[str], period_s: float = 60.0) -> None:
         super().__init__(daemon=True)
         self.zenoh, self.names = zenoh, names
         self.lies: dict[tuple[str, str], float] = {}
         self.ended = threading.Event()
-        self.samples = [s.readings for s in simulate(site, Scenario(seed=1, duration_s=60.0, dt_s=1.0))]
+        self.samples = [s.readings for s in simulate(site, Scenario(seed=1, duration_s=period_s, dt_s=1.0))]
 
     def run(self) -> None:
         while not self.ended.is_set():
@@ -148,7 +151,9 @@ class FrontHere(threading.Thread):
 class ServedCluster:
     """A front, workers by name, and the meters of their feeders."""
 
-    def __init__(self, folder: Path, database: str, site: Site, count: int) -> None:
+    def __init__(
+        self, folder: Path, database: str, site: Site, count: int, *, period_s: float = 60.0
+    ) -> None:
         self.folder, self.database, self.site = folder, database, site
         self.names = [f"copy-{k}" for k in range(count)]
         for name in self.names:
@@ -157,7 +162,7 @@ class ServedCluster:
         self.workers: dict[str, Process] = {}
         self.front: Process | FrontHere | None = None
         self.http = httpx.Client()
-        self.fleet = Fleet(self.zenoh, site, self.names)
+        self.fleet = Fleet(self.zenoh, site, self.names, period_s)
 
     def start_front_here(self) -> None:
         """Start a front without workers of its own in this process."""
@@ -302,9 +307,10 @@ def served_cluster(
     *,
     here: bool = False,
     options: tuple[str, ...] = (),
+    period_s: float = 60.0,
 ) -> Iterator[ServedCluster]:
     """A front (with `here` in this process) and workers w0, w1, ...; ended with the block."""
-    made = ServedCluster(folder, database, site, feeders)
+    made = ServedCluster(folder, database, site, feeders, period_s=period_s)
     try:
         for k in range(workers):
             made.start_worker(f"w{k}")
