@@ -68,8 +68,8 @@ class Trial:
     def raised(self) -> list[dict[str, Any]]:
         return [one for one in self.live.alarms(limit=1000) if one["kind"] == KIND]
 
-    def strike(self, fault: Fault) -> float:
-        """Cause a fault at a random moment of a tick; the time until the feeders are judged again, s."""
+    def strike(self, fault: Fault) -> tuple[float, float]:
+        """Cause a fault at a random moment of a tick; times until the feeders are judged, and decided, s."""
         time.sleep(self.rng.uniform(0.0, 2.0))
         lasted, decided = {
             Fault.STOP: self.stop,
@@ -85,7 +85,7 @@ class Trial:
         self.restart_workers()
         self.live.judged_within(self.live.names, time.time(), 60.0)
         self.check(fault)
-        return lasted
+        return lasted, decided
 
     def victim(self) -> tuple[str, list[str]]:
         """A worker with feeders, and these."""

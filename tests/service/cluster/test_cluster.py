@@ -116,7 +116,7 @@ def test_no_fault_loses_or_doubles_an_alarm(cluster: Cluster, tmp_path: Path, si
         trial.begin()
         faults = [Fault.STOP, Fault.KILL, Fault.FREEZE, Fault.TERMINATE, Fault.ROUTER]
         for fault in (*faults, *trial.rng.sample(faults, 2), Fault.OUTAGE):
-            lasted = trial.strike(fault)
+            lasted, _ = trial.strike(fault)
             assert lasted < {Fault.STOP: KILLED_S, Fault.KILL: KILLED_S}.get(fault, FROZEN_S), fault
             assert trial.violations == []
 
