@@ -38,7 +38,10 @@ def main() -> None:
     with (
         running(binaries) as server,
         tempfile.TemporaryDirectory(prefix="gridsec-failover-") as folder,
-        served_cluster(Path(folder), server.database(), load("cigre-lv"), given.feeders, WORKERS) as live,
+        served_cluster(
+            *(Path(folder), server.database(), load("cigre-lv"), given.feeders, WORKERS),
+            two_routers=Fault.SECOND in faults,
+        ) as live,
     ):
         trial = Trial(live, server, random.Random(int(time.time())))
         trial.begin()

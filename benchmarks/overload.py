@@ -1,17 +1,22 @@
 """Sustained rate of single readings, behaviour at three times that rate, and recovery.
 
-    python -m benchmarks.overload [feeders] [other source tree]
+    python -m benchmarks.overload [feeders] [seconds] [other source tree] [--workers]
 
 The real service runs as a process with copies of the Kerber suburban network, 146 meters and the busbar
-each. A zenoh client publishes single JSON readings, and the figures come from `/metrics`. The rate rises by
-a quarter per stage of 6 s, from one reading per meter and second on. The sustained rate is that of the last
-stage in which at least 95 % of the ticks due had a verdict, CLEAN or ATTACKED. Then follow 8 s at three
-times that rate, and at most 10 s at one reading per meter and second. Recovery ends when every meter is seen
-and every verdict is CLEAN. The share of `keep_states` is processor time of the judging thread in stage one.
+each; with --workers it is a front with two workers and PostgreSQL. A zenoh client publishes single JSON
+readings, and the figures come from `/metrics`. The rate rises by a quarter per stage of 6 s, from one reading
+per meter and second on. The sustained rate is that of the last stage in which at least 95 % of the ticks due
+had a verdict, CLEAN or ATTACKED. Then follow `seconds` (60 s) at three times that rate, and at most 10 s at
+one reading per meter and second. Recovery ends when every meter is seen and every verdict is CLEAN. The share
+of `keep_states` is processor time of the judging thread in stage one, without workers.
 
-Limits: the recovery takes at most 10 s, and during the overload a feeder is judged every 5 s on average.
-With another source tree the same is measured there first, and the ratios are printed. About two minutes per
-source tree.
+During the overload the list of feeders is read every 0.5 s, between two reads of the metrics. If these agree
+on `gridsec_feeders_shed`, it is compared with the number of feeders with the cause `overload`. A monitored
+feeder is on time if its latest tick is at most 3 s old; the first 3 s after its return are left out.
+
+Limits: the recovery takes at most 10 s, during the overload a feeder is judged every 5 s on average, no
+number of shed feeders differs, and 95 % of the monitored feeders are on time. With another source tree the
+same is measured there first, and the ratios are printed. About three minutes per source tree.
 """
 
 from __future__ import annotations
@@ -29,8 +34,9 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -44,10 +50,15 @@ from feeders.simulation.scenario import Scenario, simulate
 from service.cli.simulate import key_of
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import MeterClient
+from tests.service.databases import find_postgresql
+from tests.service.databases import running as running_server
 
 FEEDER = "kerber-vorstadtnetz"
-STAGE_S, SETTLE_S, OVERLOAD_S, RECOVERY_S = 6.0, 2.0, 8.0, 10.0
-"""Lengths of a stage, of its part that is not measured, of the overload, and the longest recovery, s."""
+STAGE_S, SETTLE_S, RECOVERY_S = 6.0, 2.0, 10.0
+"""Lengths of a stage, of its part that is not measured, and the longest recovery, s."""
+WORKERS = 2
+LATE_S, ON_TIME = 3.0, 0.95
+"""Age of a tick, s, from which a monitored feeder is late; least share of the feeders on time."""
 GROWTH, OVERLOAD = 1.25, 3.0
 """Ratio of the rates of two stages, and of the overload to the sustained rate."""
 STAGES = 12
@@ -91,6 +102,22 @@ class Stage:
     seen: float
 
 
+@dataclass
+class Shedding:
+    """Feeders during the overload, by the list of feeders and by the metrics."""
+
+    compared: int = 0  # numbers of shed feeders
+    different: int = 0
+    most: int = 0  # largest number of shed feeders
+    monitored: int = 0  # feeders of all reads that are not shed, nor just returned
+    late: int = 0
+
+    @property
+    def on_time(self) -> float:
+        """Share of the monitored feeders with a recent tick; 0 without any."""
+        return 1.0 - self.late / self.monitored if self.monitored else 0.0
+
+
 @dataclass(frozen=True)
 class Outcome:
     """One source tree: readings per second, share of `keep_states`, the overload, and the recovery in s."""
@@ -98,6 +125,7 @@ class Outcome:
     sustained: float
     keep_states: float
     overload: Stage
+    shedding: Shedding
     recovery_s: float
 
 
@@ -245,6 +273,39 @@ def stage(service: Service, sender: Sender, load: Load, rate: float, seconds: fl
     )
 
 
+@contextmanager
+def observed(service: Service) -> Iterator[Shedding]:
+    """Compare the list of feeders with the metrics until the block ends."""
+    found, ended = Shedding(), threading.Event()
+
+    def run() -> None:
+        returned: dict[str, float] = {}  # time of the latest read at which a feeder was shed, s
+        with httpx.Client(base_url=service.http.base_url, timeout=30.0) as http:
+            own = replace(service, http=http)
+            while not ended.wait(0.5):
+                before = metrics(own)["gridsec_feeders_shed"]
+                feeders = http.get("/api/v1/feeders").json()["feeders"]
+                now = time.monotonic()
+                shed = [one["name"] for one in feeders if one.get("cause") == "overload"]
+                returned |= dict.fromkeys(shed, now)
+                found.most = max(found.most, len(shed))
+                if metrics(own)["gridsec_feeders_shed"] == before:
+                    found.compared += 1
+                    found.different += len(shed) != before
+                for one in feeders:
+                    if now - returned.get(one["name"], float("-inf")) > LATE_S:
+                        found.monitored += 1
+                        found.late += one.get("age_s") is None or one["age_s"] > LATE_S
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        yield found
+    finally:
+        ended.set()
+        thread.join(30.0)
+
+
 def recovery(service: Service, names: Sequence[str], meters: int) -> float:
     """Time until every meter is seen and every verdict is CLEAN, s; infinite if beyond the limit."""
     begun = time.monotonic()
@@ -257,35 +318,44 @@ def recovery(service: Service, names: Sequence[str], meters: int) -> float:
     return float("inf")
 
 
-def measure(tree: Path, folder: Path, names: Sequence[str], load: Load) -> Outcome:
-    """Measure one source tree."""
+def measure(
+    tree: Path, folder: Path, names: Sequence[str], load: Load, *, seconds: float, database: str | None = None
+) -> Outcome:
+    """Measure one source tree: one process, or with a database a front with workers."""
+    workers = 0 if database is None else WORKERS
     base = float(len(load.keys))
     print(f"{tree}: {len(names)} feeders, {len(load.keys)} sources", flush=True)
     print("sent/s  used/s  judged  decided  seen", flush=True)
-    with running(tree, folder, names) as service:
+    with running(tree, folder, names, workers=workers, database=database) as service:
         sender = Sender(load, service.zenoh, base)
         sender.start()
         try:
             time.sleep(STAGE_S)
-            sustained, share = 0.0, _totals(service)
+            sustained, share = 0.0, {} if workers else _totals(service)
             for number in range(STAGES):
                 found = stage(service, sender, load, base * GROWTH**number, STAGE_S)
                 _print(found)
-                if number == 0:
+                if number == 0 and not workers:
                     share = {name: total - share[name] for name, total in _totals(service).items()}
                 if found.decided < DECIDED:
                     break
                 sustained = found.offered
-            overload = stage(service, sender, load, OVERLOAD * max(sustained, base), OVERLOAD_S)
+            with observed(service) as shedding:
+                overload = stage(service, sender, load, OVERLOAD * max(sustained, base), seconds)
             _print(overload)
             sender.rate = base
             recovery_s = recovery(service, names, len(load.fields[0]) - 1)
         finally:
             sender.ended.set()
             sender.join(STOP_S)
-    kept = share["keep_states"] / share["cycle"]
+    kept = share["keep_states"] / share["cycle"] if share else 0.0
     print(f"sustained {sustained:.0f}/s, keep_states {kept:.1%}, recovery {recovery_s:.1f} s", flush=True)
-    return Outcome(sustained, kept, overload, recovery_s)
+    print(f"{shedding.different} of {shedding.compared} numbers of shed feeders differ", flush=True)
+    print(
+        f"at most {shedding.most} of {len(names)} shed, on time {shedding.on_time:.3f} of the others",
+        flush=True,
+    )
+    return Outcome(sustained, kept, overload, shedding, recovery_s)
 
 
 def _print(found: Stage) -> None:
@@ -307,23 +377,34 @@ def _totals(service: Service) -> dict[str, float]:
 
 def main() -> int:
     """Measure, compare, and check the limits."""
-    asked = arguments(__doc__, feeders=10, against="")
+    asked = arguments(__doc__, feeders=10, seconds=60.0, against="", workers=False)
     site = load(FEEDER)
     names = [f"feeder-{k:03d}" for k in range(asked.feeders)]
     own = Path(__file__).parents[1]
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        database = None
+        if asked.workers:
+            if (binaries := find_postgresql()) is None:
+                raise SystemExit("PostgreSQL's initdb, pg_ctl and postgres are not installed")
+            database = stack.enter_context(running_server(binaries)).database()
         for name in names:
             tables = site.tables
             write(replace(tables, meta=replace(tables.meta, name=name)), folder / name)
         said = load_of(site, names)
-        before = measure(Path(asked.against).resolve(), folder, names, said) if asked.against else None
-        now = measure(own, folder, names, said)
+        measured = partial(measure, folder=folder, names=names, load=said, seconds=asked.seconds)
+        before = measured(Path(asked.against).resolve(), database=database) if asked.against else None
+        now = measured(own, database=database)
     if before is not None:
         print(f"sustained rate, ratio to {asked.against}: {now.sustained / max(before.sustained, 1.0):.2f}")
         print(f"share of keep_states: {before.keep_states:.1%} before, {now.keep_states:.1%} now")
-    judged = now.overload.judged * JUDGED_EVERY_S >= 1.0
-    return int(not (now.recovery_s <= RECOVERY_S and judged))
+    held = [
+        now.recovery_s <= RECOVERY_S,
+        now.overload.judged * JUDGED_EVERY_S >= 1.0,
+        now.shedding.different == 0,
+        now.shedding.on_time >= ON_TIME,
+    ]
+    return int(not all(held))
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import re
 import threading
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 from weakref import WeakValueDictionary
 
@@ -81,7 +81,7 @@ class Workers:
         now = time.monotonic()
         with self._lock:
             before = self._heard.get(state.worker)
-            if before is not None and state.t <= before.state.t:
+            if before is not None and state.order <= before.state.order:
                 return  # repeated, or overtaken
             self._heard[state.worker] = _Heard(now, state)
             for name in [one for one, kept in self._heard.items() if now - kept.at > FORGET_S]:
@@ -108,9 +108,17 @@ class Workers:
         return heard.state, epoch
 
     def entry(self, feeder: str) -> Entry | None:
-        """Entry of a feeder by its owner; None without an owner, or before it has taken over."""
+        """Entry of a feeder by its owner; None without an owner, or before it has taken over.
+
+        The age of its tick includes the time since the message.
+        """
         found = self.owner(feeder)
-        return None if found is None else found[0].feeders.get(feeder)
+        entry = None if found is None else found[0].feeders.get(feeder)
+        if found is None or entry is None or entry.now.get("age_s") is None:
+            return entry
+        with self._lock:
+            since_s = time.monotonic() - self._heard[found[0].worker].at
+        return replace(entry, now={**entry.now, "age_s": entry.now["age_s"] + since_s})
 
     def last_entry(self, feeder: str) -> Entry | None:
         """Latest entry of a feeder, also of a silent worker; None before the first one."""

@@ -36,6 +36,7 @@ from service.report.feeder_info import Ownership
 from service.report.report import FeederReport
 from service.store import Store, StoreUnavailable
 from service.store.incidents import suppression_mark
+from service.store.leases import clock_problem
 
 _SAMPLE = re.compile(rb"^([A-Za-z_:][A-Za-z0-9_:]*)(?:\{(.*)\})? (.+)$")
 """A sample: name, labels, value with an optional time."""
@@ -114,6 +115,7 @@ class Front:
     catalogue: feeders of the database.
     given: feeders of the command line.
     live_workers: names of the workers with a lease in the database.
+    cluster_time: time of the database, Unix s.
     shelve_most_s: longest time of a shelf, s.
     wall: wall clock, Unix s.
     """
@@ -126,6 +128,7 @@ class Front:
         given: Mapping[str, Site],
         *,
         live_workers: Callable[[], list[str]],
+        cluster_time: Callable[[], float] = time.time,
         shelve_most_s: float,
         wall: Callable[[], float] = time.time,
     ) -> None:
@@ -133,7 +136,8 @@ class Front:
         self.shelve_most_s = shelve_most_s
         self._workers, self._catalogue = workers, catalogue
         self._way: Forwarder | None = None
-        self._given, self._wall, self._live_workers = given, wall, live_workers
+        self._given, self._live_workers = given, live_workers
+        self._wall, self._cluster_time = wall, cluster_time
         self._metrics = Metrics()
         self._missing = set(given)
         self._problem: str | None = None
@@ -275,7 +279,7 @@ class Front:
         """Return the numbers of a feeder in the list of feeders."""
         entry = self._workers.entry(name)
         if entry is not None:
-            return self._aged(dict(entry.now))
+            return dict(entry.now)
         before = self._workers.last_entry(name)
         now = {} if before is None else dict(before.now)
         undecided = {
@@ -289,11 +293,6 @@ class Front:
             "age_s": None,
         }
         return {**now, **undecided}
-
-    def _aged(self, now: dict[str, Any]) -> dict[str, Any]:
-        if now.get("t") is not None:
-            now["age_s"] = max(now.get("age_s") or 0.0, self._wall() - now["t"])
-        return now
 
     def feeder(self, name: str) -> dict[str, Any] | None:
         """Return the meters of a feeder as in its layout, or None."""
@@ -345,8 +344,11 @@ class Front:
         return None if found is None else Ownership(found[0].worker, found[1])
 
     def age(self, report: FeederReport) -> float:
-        """Return the age of a feeder's latest report, s."""
-        return max(0.0, self._wall() - report.t)
+        """Return the age of a feeder's latest report by the clock of its worker, s."""
+        entry = self._workers.entry(report.feeder)
+        if entry is None or entry.t is None:
+            return max(0.0, self._wall() - report.t)
+        return max(0.0, float(entry.now["age_s"]) + entry.t - report.t)
 
     def commissioning(self, name: str) -> CommissioningProgress | None:
         """Return None: the owner of a feeder answers requests for its commissioning."""
@@ -387,6 +389,8 @@ class Front:
         problems += [f"worker {name}: silent on zenoh" for name in self._registered if name not in heard]
         if self._problem is not None:
             problems.append(self._problem)
+        elif (problem := clock_problem(self._wall(), self._cluster_time())) is not None:
+            problems.append(f"front: {problem}")
         problems += [f"feeder {name}: it is not in the database yet" for name in sorted(self._missing)]
         problems += [
             f"feeder {name}: no worker monitors it"

@@ -2,7 +2,8 @@
 
 Envelope. A zenoh client may publish on any key that the router permits. Each message therefore has an
 HMAC-SHA256 by a secret that only readers of the database know. The tag covers the purpose and the key: a
-message of one worker is not valid for another one. A message older than `FRESH_S` is refused.
+message of one worker is not valid for another one. A message older than `FRESH_S` is refused. The time is
+that of the database (`Leases.clock`): the clocks of the machines do not matter.
 
 State. A worker sends its leases and the entries of its feeders in the list on `@worker/<worker>/state`: after
 new ticks, at most every `GATHER_S`, and at least every `SILENT_S`. A feeder takes about 0.6 kB.
@@ -31,7 +32,7 @@ from service.access.identity import OPEN, Identity, Role
 from service.api.dependencies import IDENTITY
 
 FRESH_S: Final = 30.0
-"""Largest age of a message, s: above the difference of the clocks of two machines of a cluster."""
+"""Largest age of a message, s."""
 _TAG: Final = 32
 """Length of the tag, bytes."""
 
@@ -46,16 +47,16 @@ class Envelope:
     """Encoding of messages, CBOR with a tag in front. Thread-safe.
 
     secret: secret of the cluster.
-    wall: wall clock, Unix s.
+    clock: time of the cluster, Unix s.
     """
 
-    def __init__(self, secret: bytes, wall: Callable[[], float] = time.time) -> None:
-        self._secret, self._wall = secret, wall
+    def __init__(self, secret: bytes, clock: Callable[[], float] = time.time) -> None:
+        self._secret, self._clock = secret, clock
         self._seen: dict[str, float] = {}
 
     def seal(self, purpose: str, content: dict[str, Any]) -> bytes:
         """Return a message. `purpose` names the key and the direction."""
-        body = cbor2.dumps({"t": self._wall(), "id": secrets.token_hex(8), **content})
+        body = cbor2.dumps({"t": self._clock(), "id": secrets.token_hex(8), **content})
         return self._tag(purpose, body) + body
 
     def open(self, purpose: str, message: bytes, *, once: bool = False) -> dict[str, Any]:
@@ -67,7 +68,7 @@ class Envelope:
         if not hmac.compare_digest(tag, self._tag(purpose, body)):
             raise MessageRefused(f"{purpose}: the signature is not that of this cluster")
         found: dict[str, Any] = cbor2.loads(body)
-        now = self._wall()
+        now = self._clock()
         if abs(now - found["t"]) > FRESH_S:
             raise MessageRefused(f"{purpose}: the message is {now - found['t']:.0f} s old")
         if once:
@@ -110,7 +111,7 @@ class WorkerState:
     """State of one worker."""
 
     worker: str
-    t: float  # wall time of the message, Unix s
+    order: tuple[int, int]  # registration of the worker, and number of the message since
     shards: Mapping[int, int]  # epoch of its lease by shard
     feeders: Mapping[str, Entry]
     unstored: int  # changes of alarms that wait for the database
@@ -121,6 +122,7 @@ class WorkerState:
         """Content of its message."""
         return {
             "worker": self.worker,
+            "order": list(self.order),
             "shards": dict(self.shards),
             "feeders": [[dict(one.fields), dict(one.now)] for one in self.feeders.values()],
             "unstored": self.unstored,
@@ -133,7 +135,7 @@ class WorkerState:
         """The state of a message."""
         return cls(
             content["worker"],
-            content["t"],
+            tuple(content["order"]),
             content["shards"],
             {fields["name"]: Entry(fields, now) for fields, now in content["feeders"]},
             content["unstored"],

@@ -203,7 +203,7 @@ async def serve_front(
     }
     with ExitStack() as stack:
         leases = stack.enter_context(Leases(settings.database, OBSERVER))
-        envelope = Envelope(cluster_secret(settings.database), wall)
+        envelope = Envelope(cluster_secret(settings.database), leases.clock)
         store = stack.enter_context(ObservedStore(settings.database, leases=leases))
         http = HttpSide.open(stack, settings, shares, targets, wall)
         workers = Workers(envelope)
@@ -213,6 +213,7 @@ async def serve_front(
             Catalogue(store),
             sites,
             live_workers=leases.live_workers,
+            cluster_time=leases.clock,
             shelve_most_s=3600.0 * settings.max_shelve_h,
             wall=wall,
         )

@@ -35,7 +35,7 @@ from service.report.feeder_info import Ownership
 from service.settings import Settings
 from service.store import Store, StoreUnavailable
 from service.store.cluster_secret import cluster_secret
-from service.store.leases import POLL_S, RENEW_S, Leases, shard_of
+from service.store.leases import POLL_S, RENEW_S, Leases, clock_problem, shard_of
 from service.store.schema import LeaseLost, WriterLost
 
 REFRESH_S: Final = 1.0
@@ -90,6 +90,7 @@ class Member:
         # End of the latest freeze, monotonic s, until a later renewal has ended; None without one.
         self._woke: float | None = None
         self._renew = asyncio.Event()
+        self._messages = 0
         self.problem: str | None = None
 
     # ------------------------------------------------------------ state, without a call to the database
@@ -110,6 +111,11 @@ class Member:
     def name(self) -> str:
         """Name of the worker."""
         return self._leases.worker
+
+    def order(self) -> tuple[int, int]:
+        """Order of the next message: later ones, also of a later process with this name, are larger."""
+        self._messages += 1
+        return self._leases.number, self._messages
 
     def shards(self) -> dict[int, int]:
         """Epochs of the held leases by shard."""
@@ -299,7 +305,7 @@ async def work(
     shares = Shares.of(raise_limit())
     with ExitStack() as stack:
         leases = stack.enter_context(Leases(settings.database, name))
-        envelope = Envelope(cluster_secret(settings.database), wall)
+        envelope = Envelope(cluster_secret(settings.database), leases.clock)
         leases.register()
         store = stack.enter_context(Store(settings.database, leases=leases))
         member = Member(leases, Catalogue(store))
@@ -321,7 +327,10 @@ async def work(
         announce(stop.set)
         _log.info("working", worker=name)
         with stop_on_signals(stop, active=signals):
-            await _until_stopped(runtime, member, bus, envelope, stop, stopping=stopping, lost=lost)
+            content = partial(_content, runtime, member, lambda: clock_problem(wall(), leases.clock()))
+            await _until_stopped(
+                runtime, member, bus, envelope, stop, content=content, stopping=stopping, lost=lost
+            )
 
 
 async def _until_stopped(
@@ -331,6 +340,7 @@ async def _until_stopped(
     envelope: Envelope,
     stop: asyncio.Event,
     *,
+    content: Callable[[], dict[str, Any]],
     stopping: Callable[[], None],
     lost: Callable[[BaseException], None],
 ) -> None:
@@ -342,7 +352,7 @@ async def _until_stopped(
         asyncio.create_task(member.run(runtime, bus), name="leases"),
         asyncio.create_task(_note_news(runtime, news), name="news"),
         asyncio.create_task(
-            report_states(partial(_content, runtime, member), bus.tell, member.name, envelope, news),
+            report_states(content, bus.tell, member.name, envelope, news),
             name="states",
         ),
     ]
@@ -379,15 +389,13 @@ async def _note_news(runtime: Runtime, news: asyncio.Event) -> None:
         news.set()
 
 
-def _content(runtime: Runtime, member: Member) -> dict[str, Any]:
-    """Content of the message of a worker."""
+def _content(runtime: Runtime, member: Member, clock: Callable[[], str | None]) -> dict[str, Any]:
+    """Content of the message of a worker. `clock` returns the problem of its clock."""
     unstored, problem = runtime.unstored()
-    reasons = runtime.ready()[1]
-    if member.problem is not None:
-        reasons.append(member.problem)
+    reasons = runtime.ready()[1] + [one for one in (member.problem, clock()) if one is not None]
     found = WorkerState(
         member.name,
-        0.0,
+        member.order(),
         member.shards(),
         {fields["name"]: Entry(fields, runtime.summary(fields["name"])) for fields in runtime.feeders()},
         unstored,

@@ -42,6 +42,8 @@ GRACE_S: Final = 0.5
 """Absence after which the shards of a worker are free, s; above `POLL_S`, within which it reconnects."""
 SETTLE_S: Final = 2.0
 """Wait for further workers, s, while no live worker has a shard: all workers start at once."""
+CLOCK_S: Final = 30.0
+"""Difference of the clocks of a process and of the database that is a problem, s."""
 WORKER_LOCKS: Final = 0x6773_776B
 """Class of the workers' advisory locks."""
 _CLAIM_LOCK: Final = 0x6772_6964_636C_6D00
@@ -55,6 +57,14 @@ _SESSIONS = sa.text(
     "SELECT objid FROM pg_locks WHERE locktype = 'advisory' AND classid = :locks AND objsubid = 2 "
     "AND granted AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
 ).bindparams(locks=WORKER_LOCKS)
+
+
+def clock_problem(wall: float, cluster: float) -> str | None:
+    """Return the problem of a process's clock at a time of the cluster, both Unix s; None without one."""
+    ahead = wall - cluster
+    if abs(ahead) <= CLOCK_S:
+        return None
+    return f"clock of the machine: {abs(ahead):.0f} s {'ahead of' if ahead > 0 else 'behind'} the database"
 
 
 def shard_of(feeder: str) -> int:
@@ -126,6 +136,7 @@ class Leases:
         self._change = threading.Lock()
         self._number: int | None = None
         self._renewed = float("-inf")
+        self._offset_s = 0.0  # Unix time of the database minus this process's monotonic time, s
         # Beginning of each absence in this process's monotonic time, s, within one session.
         self._absent: dict[int, float] = {}
         self._engine, self.name = _engine(database, self._connected)
@@ -215,6 +226,13 @@ class Leases:
     def number(self) -> int:
         """Number of this worker; 0 of an observer."""
         return self._number or 0
+
+    def clock(self) -> float:
+        """Return the time of the database by the latest call and the monotonic time since, Unix s.
+
+        It is the same in all processes of a cluster, for any clock of their machines.
+        """
+        return time.monotonic() + self._offset_s
 
     @property
     def held(self) -> Mapping[int, Lease]:
@@ -400,7 +418,9 @@ class Leases:
     def _begun(self) -> sa.Connection:
         connection = self._engine.connect()
         try:
-            connection.scalar(sa.select(1))
+            asked = time.monotonic()
+            now = float(connection.scalar(sa.select(_NOW)) or 0.0)
+            self._offset_s = now - 0.5 * (asked + time.monotonic())
         except sa.exc.DBAPIError as error:
             connection.close()
             if not error.connection_invalidated or isinstance(error.orig, NoAnswer):

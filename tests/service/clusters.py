@@ -6,6 +6,7 @@ import asyncio
 import json
 import os
 import signal
+import struct
 import subprocess
 import sys
 import threading
@@ -31,7 +32,25 @@ from service.ingest.zenoh_bus import MeterClient
 from service.settings import Settings, settings
 from tests.service.running import PATIENCE_S, free_port, until
 
-PROGRAM = "from service.cli.main import main; main()"
+PROGRAM = """
+import mmap, struct, sys, time
+with open(sys.argv.pop(1), "rb") as file:
+    leap = mmap.mmap(file.fileno(), 8, access=mmap.ACCESS_READ)
+real = time.time
+time.time = lambda: real() + struct.unpack("d", leap)[0]
+from service.cli.main import main
+main()
+"""
+"""The command `gridsec` with a wall clock that the file of its first argument shifts."""
+ROUTER = """
+import sys
+from service.ingest.queues import BusConfig
+from service.ingest.zenoh_bus import session
+with session(BusConfig("router", listen=(sys.argv[1],), connect=(sys.argv[2],))):
+    sys.stdin.read()
+"""
+"""A zenoh router: listens on the first endpoint, and connects to the router of the second one."""
+NO_WORKERS = ("--workers", "0")
 LIE_VOLT = 20.0
 """Error of a manipulated meter, V."""
 JUDGING = {"agreement", "residuals", "settling", "ambiguous", "misfit", "too-many-suspects"}
@@ -39,14 +58,18 @@ JUDGING = {"agreement", "residuals", "settling", "ambiguous", "misfit", "too-man
 
 
 class Fleet(threading.Thread):
-    """All meters of feeders with the tables of one site, one reading per second, by the wall clock."""
+    """All meters of feeders with the tables of one site, one reading per second, by the wall clock.
 
-    def __init__(self, zenoh: str, site: Site, names: list[str]) -> None:
+    period_s: time after which the simulated readings repeat, s.
+    """
+
+    def __init__(self, zenoh: str, site: Site, names: list[str], period_s: float = 60.0) -> None:
         super().__init__(daemon=True)
         self.zenoh, self.names = zenoh, names
         self.lies: dict[tuple[str, str], float] = {}
+        self.ahead_s = 0.0  # shift of the meters' clocks
         self.ended = threading.Event()
-        self.samples = [s.readings for s in simulate(site, Scenario(seed=1, duration_s=60.0, dt_s=1.0))]
+        self.samples = [s.readings for s in simulate(site, Scenario(seed=1, duration_s=period_s, dt_s=1.0))]
 
     def run(self) -> None:
         while not self.ended.is_set():
@@ -59,7 +82,7 @@ class Fleet(threading.Thread):
 
     def _report(self, meters: MeterClient) -> None:
         while not self.ended.is_set():
-            now = time.time()
+            now = time.time() + self.ahead_s
             for reading in self.samples[int(now) % len(self.samples)]:
                 for name in self.names:
                     lie = self.lies.get((name, reading.meter), 0.0)
@@ -67,17 +90,20 @@ class Fleet(threading.Thread):
                     if reading.meter != BUSBAR:
                         fields["p_kw"] = reading.p_kw or 0.0
                     meters.put(key_of(name, reading.meter), json.dumps(fields).encode())
-            self.ended.wait(max(0.0, 1.0 - (time.time() - now)))
+            self.ended.wait(max(0.0, 1.0 - (time.time() + self.ahead_s - now)))
 
 
 class Process:
-    """A command of gridsec as a process, with its log in a file."""
+    """A command of gridsec, or another program, as a process, with its log in a file."""
 
-    def __init__(self, log: Path, *arguments: str, **environment: str) -> None:
-        self.log = log
+    def __init__(self, log: Path, *arguments: str, program: str = PROGRAM, **environment: str) -> None:
+        self.log, self.clock = log, log.with_suffix(".clock")
+        if program is PROGRAM:
+            self.leap(0.0)
+            arguments = (str(self.clock), *arguments)
         with log.open("ab") as file:
             self.popen = subprocess.Popen(
-                [sys.executable, "-c", PROGRAM, *arguments],
+                [sys.executable, "-c", program, *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=file,
@@ -88,6 +114,11 @@ class Process:
     @property
     def pid(self) -> int:
         return self.popen.pid
+
+    def leap(self, ahead_s: float) -> None:
+        """Shift the wall clock of the process against that of the machine, s."""
+        with self.clock.open("r+b" if self.clock.exists() else "wb") as file:
+            file.write(struct.pack("d", ahead_s))
 
     def send(self, number: signal.Signals) -> None:
         self.popen.send_signal(number)
@@ -148,16 +179,27 @@ class FrontHere(threading.Thread):
 class ServedCluster:
     """A front, workers by name, and the meters of their feeders."""
 
-    def __init__(self, folder: Path, database: str, site: Site, count: int) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        database: str,
+        site: Site,
+        count: int,
+        *,
+        period_s: float = 60.0,
+        two_routers: bool = False,
+    ) -> None:
         self.folder, self.database, self.site = folder, database, site
         self.names = [f"copy-{k}" for k in range(count)]
         for name in self.names:
             write(replace(site.tables, meta=replace(site.tables.meta, name=name)), folder / name)
         self.zenoh = f"tcp/127.0.0.1:{free_port()}"
+        self.second = f"tcp/127.0.0.1:{free_port()}" if two_routers else None
+        self.router: Process | None = None
         self.workers: dict[str, Process] = {}
         self.front: Process | FrontHere | None = None
         self.http = httpx.Client()
-        self.fleet = Fleet(self.zenoh, site, self.names)
+        self.fleet = Fleet(self.zenoh, site, self.names, period_s)
 
     def start_front_here(self) -> None:
         """Start a front without workers of its own in this process."""
@@ -173,14 +215,19 @@ class ServedCluster:
         front = self.front = FrontHere(chosen)
         self.http = httpx.Client(base_url=front.url, timeout=20.0)
 
-    def start_front(self, *options: str) -> None:
-        """Start a front as a process, by default without workers of its own."""
+    def start_router(self) -> None:
+        """Start the second router as a process; the workers prefer it to the front."""
+        assert self.second is not None
+        self.router = Process(self.folder / "router.log", self.second, self.zenoh, program=ROUTER)
+
+    def start_front(self, options: tuple[str, ...] = NO_WORKERS) -> None:
+        """Start a front as a process, by default without workers of its own; without options a service."""
         feeders = [part for name in self.names for part in ("--feeder", str(self.folder / name))]
         address = f"127.0.0.1:{free_port()}"
         front = self.front = Process(
             self.folder / "front.log",
             "serve",
-            *(options or ("--workers", "0")),
+            *options,
             *feeders,
             *("--zenoh-listen", self.zenoh, "--http", address, "--database", self.database),
         )
@@ -190,9 +237,11 @@ class ServedCluster:
         self.http = httpx.Client(base_url=line, timeout=20.0)
 
     def start_worker(self, name: str) -> Process:
+        routers = [end for end in (self.second, self.zenoh) if end is not None]
         made = self.workers[name] = Process(
             self.folder / f"{name}.log",
-            *("worker", "--name", name, "--zenoh-connect", self.zenoh, "--database", self.database),
+            *("worker", "--name", name, "--database", self.database),
+            *(part for end in routers for part in ("--zenoh-connect", end)),
             PGAPPNAME=name,
         )
         return made
@@ -201,8 +250,9 @@ class ServedCluster:
         self.fleet.ended.set()
         if self.fleet.is_alive():
             self.fleet.join(10.0)
-        for process in (*self.workers.values(), *([] if self.front is None else [self.front])):
-            process.end()
+        for process in (*self.workers.values(), self.front, self.router):
+            if process is not None:
+                process.end()
         self.http.close()
 
     # -------------------------------------------------------------------------------------------- requests
@@ -311,17 +361,21 @@ def served_cluster(
     workers: int,
     *,
     here: bool = False,
-    options: tuple[str, ...] = (),
+    options: tuple[str, ...] = NO_WORKERS,
+    period_s: float = 60.0,
+    two_routers: bool = False,
 ) -> Iterator[ServedCluster]:
     """A front (with `here` in this process) and workers w0, w1, ...; ended with the block."""
-    made = ServedCluster(folder, database, site, feeders)
+    made = ServedCluster(folder, database, site, feeders, period_s=period_s, two_routers=two_routers)
     try:
+        if two_routers:
+            made.start_router()
         for k in range(workers):
             made.start_worker(f"w{k}")
         if here:
             made.start_front_here()
         else:
-            made.start_front(*options)
+            made.start_front(options)
         made.fleet.start()
         yield made
     finally:

@@ -34,6 +34,7 @@ class Fault(StrEnum):
     STOP = "stop"  # SIGTERM of a worker
     KILL = "kill"  # SIGKILL of a worker
     FREEZE = "freeze"  # SIGSTOP of a worker, then SIGCONT
+    SECOND = "second"  # SIGKILL of a second zenoh router, and its start
     ROUTER = "router"  # SIGKILL of the front, which is the zenoh router, and its start
     TERMINATE = "terminate"  # pg_terminate_backend of all sessions
     OUTAGE = "outage"  # PostgreSQL stopped for `OUTAGE_S`
@@ -76,6 +77,7 @@ class Trial:
             Fault.STOP: self.stop,
             Fault.KILL: self.kill,
             Fault.FREEZE: self.freeze,
+            Fault.SECOND: self.second,
             Fault.ROUTER: self.router,
             Fault.TERMINATE: self.terminate,
             Fault.OUTAGE: self.outage,
@@ -118,6 +120,16 @@ class Trial:
         code, written = self.live.workers[name].popen.wait(timeout=20.0), self.writes.of(name, continued)
         if (code, written) != (LEASE_LOST, 0):
             self.violations.append(f"freeze: exit code {code}, {written} writes afterwards")
+        return lasted
+
+    def second(self) -> tuple[float, float]:
+        router = self.live.router
+        assert router is not None
+        began = time.time()
+        router.send(signal.SIGKILL)
+        lasted = self.judged(self.live.names, began)
+        router.end()
+        self.live.start_router()
         return lasted
 
     def router(self) -> tuple[float, float]:

@@ -48,6 +48,7 @@ class Pair:
         self.workers = Workers(envelope)
         self.worker = worker
         self.names: set[str] = set()
+        self.messages = 0
         self.forwarder = Forwarder(
             self.workers,
             service.store,
@@ -61,7 +62,8 @@ class Pair:
         """State of the worker: the leases of `village` and `farm`, and entries of taken-over feeders."""
         shards = {shard_of(name): 1 for name in ("village", "farm")}
         entries = {name: Entry({"name": name}, {}) for name in feeders}
-        state = WorkerState("w0", 0.0, shards, entries, 0, None, ())
+        self.messages += 1
+        state = WorkerState("w0", (1, self.messages), shards, entries, 0, None, ())
         self.workers.take(Envelope(b"secret").seal(STATES, state.content()))
 
     def status(self, feeder: str) -> int:
@@ -155,7 +157,7 @@ def test_a_request_does_not_outlast_its_owner(pair: Pair) -> None:
     workers, sender = Workers(pair.envelope), Envelope(b"secret")
 
     def report(worker: str, epoch: int) -> None:
-        state = WorkerState(worker, 0.0, {shard_of("village"): epoch}, {}, 0, None, ())
+        state = WorkerState(worker, (1, epoch), {shard_of("village"): epoch}, {}, 0, None, ())
         workers.take(sender.seal(STATES, state.content()))
 
     unanswered: list[Callable[[bytes], None]] = []

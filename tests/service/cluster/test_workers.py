@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from itertools import count
 
@@ -19,15 +20,24 @@ class Heard:
     """Workers, and messages to them at consecutive times."""
 
     def __init__(self) -> None:
-        self.clock: Iterator[float] = map(float, count(1_000))
-        self.sender = Envelope(b"secret", lambda: next(self.clock))
-        self.workers = Workers(Envelope(b"secret", lambda: 1_010.0))
+        self.now = 1_000.0
+        self.numbers: Iterator[int] = count(1)
+        self.sender = Envelope(b"secret", lambda: self.now)
+        self.workers = Workers(Envelope(b"secret", lambda: self.now))
 
-    def message(self, worker: str, epoch: int | None, verdict: str = "clean") -> bytes:
+    def message(
+        self, worker: str, epoch: int | None, verdict: str = "clean", order: tuple[int, int] | None = None
+    ) -> bytes:
         shards = {} if epoch is None else {SHARD: epoch}
-        entry = Entry({"name": "village"}, {"t": 1.0, "verdict": verdict})
+        entry = Entry({"name": "village"}, {"t": 1.0, "verdict": verdict, "age_s": 0.5})
         feeders = {} if epoch is None else {"village": entry}
-        return self.sender.seal(STATES, WorkerState(worker, 0.0, shards, feeders, 0, None, ()).content())
+        order = order or (1, next(self.numbers))
+        return self.sender.seal(STATES, WorkerState(worker, order, shards, feeders, 0, None, ()).content())
+
+    def verdict(self) -> str:
+        entry = self.workers.entry("village")
+        assert entry is not None
+        return str(entry.now["verdict"])
 
     def owner(self) -> tuple[str, int] | None:
         found = self.workers.owner("village")
@@ -44,9 +54,7 @@ def test_the_highest_epoch_owns_a_feeder() -> None:
     # The earlier owner continues after a freeze.
     heard.workers.take(heard.message("w0", 1))
     assert heard.owner() == ("w1", 2)
-    entry = heard.workers.entry("village")
-    assert entry is not None
-    assert entry.now["verdict"] == "attacked"
+    assert heard.verdict() == "attacked"
 
 
 def test_a_released_shard_has_no_owner() -> None:
@@ -72,6 +80,30 @@ def test_repeated_and_forged_messages_change_nothing() -> None:
     first, second = heard.message("w0", 1), heard.message("w0", 1, "attacked")
     for message in (second, first, b"", Envelope(b"other").seal(STATES, {}), heard.sender.seal(STATES, {})):
         heard.workers.take(message)
+    assert heard.verdict() == "attacked"
+
+
+@pytest.mark.parametrize("leap_s", [3600.0, -3600.0, -10.0])
+def test_a_leap_of_the_clock_of_the_database_silences_no_worker(leap_s: float) -> None:
+    heard = Heard()
+    heard.workers.take(heard.message("w0", 1))
+    heard.now += leap_s
+    heard.workers.take(heard.message("w0", 1, "attacked"))
+    assert heard.verdict() == "attacked"
+
+
+def test_a_restarted_worker_is_heard_at_once() -> None:
+    heard = Heard()
+    heard.workers.take(heard.message("w0", 1, order=(1, 1000)))
+    heard.workers.take(heard.message("w0", 2, "attacked", order=(2, 1)))
+    assert heard.verdict() == "attacked"
+
+
+def test_the_age_of_a_tick_includes_the_time_since_the_message() -> None:
+    heard = Heard()
+    heard.workers.take(heard.message("w0", 1))
+    sent = time.monotonic()
+    time.sleep(0.05)
     entry = heard.workers.entry("village")
     assert entry is not None
-    assert entry.now["verdict"] == "attacked"
+    assert 0.05 <= entry.now["age_s"] - 0.5 <= time.monotonic() - sent + 0.05

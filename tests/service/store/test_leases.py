@@ -18,7 +18,7 @@ import pytest
 import sqlalchemy as sa
 
 from service.store import Store, StoreUnavailable, connect, leases
-from service.store.leases import SHARDS, Lease, Leases, shard_of
+from service.store.leases import SHARDS, Lease, Leases, clock_problem, shard_of
 from service.store.schema import LeaseLost
 from tests.codes import refused
 from tests.service.databases import Cluster
@@ -100,6 +100,28 @@ def test_the_shard_of_a_feeder_never_changes() -> None:
     for k in range(20_000):
         counts[shard_of(f"feeder-{k}")] += 1
     assert 40 < min(counts) <= max(counts) < 125
+
+
+def test_the_clock_is_that_of_the_database(join: Join, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    worker = join("a")
+
+    def ahead() -> float:
+        with psycopg.connect(url.replace("+psycopg", "")) as other:
+            row = other.execute("SELECT extract(epoch FROM clock_timestamp())").fetchone()
+        assert row is not None
+        return worker.clock() - float(row[0])
+
+    assert abs(ahead()) < 0.5
+    # A leap of the database is found by the next call.
+    monkeypatch.setattr(leases, "_NOW", leases._NOW - 3600.0)
+    worker.live_workers()
+    assert abs(ahead() + 3600.0) < 0.5
+
+
+@pytest.mark.parametrize(("ahead_s", "found"), [(3600.0, "3600 s ahead of"), (-31.0, "31 s behind")])
+def test_a_wrong_clock_is_a_problem(ahead_s: float, found: str) -> None:
+    assert found in (clock_problem(1e9 + ahead_s, 1e9) or "")
+    assert clock_problem(1e9 + 0.1 * ahead_s / abs(ahead_s), 1e9) is None
 
 
 def test_one_worker_holds_all(join: Join) -> None:

@@ -1,0 +1,59 @@
+"""Effect of hostile clients on a single service and on a front with two workers.
+
+    python -m benchmarks.hostile [SECONDS] [FEEDERS]
+
+Idle connections, stalled streams, and floods of one peer by form (`tests.service.hostile`), each for SECONDS.
+For each attack: slowest list of the feeders, largest age of a tick of the other feeders, late ones (age above
+5 s), failed requests, growth of private memory and of the logs. Exit code 1 if a feeder is late or a request
+fails.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks._arguments import arguments
+from feeders.model.site import load
+from tests.service import hostile
+from tests.service.clusters import served_cluster
+from tests.service.databases import find_postgresql, running
+from tests.service.running import until
+
+FEEDER = "cigre-lv"
+
+
+def main() -> int:
+    """Measure, and print a table."""
+    asked = arguments(__doc__, seconds=20.0, feeders=4)
+    binaries = find_postgresql()
+    if binaries is None:
+        raise SystemExit("PostgreSQL's initdb, pg_ctl and postgres are not installed")
+    missed = False
+    print("| processes | attack | list, s | age, s | late | failed | memory, MB | log lines |", flush=True)
+    print("|---|---|---|---|---|---|---|---|", flush=True)
+    with running(binaries) as server:
+        for kind, options in hostile.KINDS.items():
+            with (
+                tempfile.TemporaryDirectory(prefix="gridsec-hostile-") as folder,
+                served_cluster(
+                    *(Path(folder), server.database(), load(FEEDER), asked.feeders, 0), options=options
+                ) as live,
+            ):
+                until(lambda: live.http.get("/readyz").status_code == 200, "readiness")
+                live.judged_within(live.names, time.time() - 1.0, 60.0)
+                for name, (attack, names) in hostile.attacks(live).items():
+                    cost = hostile.attacked(live, attack(), asked.seconds)
+                    watch, late = cost.watch, cost.watch.late(names)
+                    age_s = max(watch.ages_s.get(name, float("inf")) for name in names)
+                    cells = f"{watch.slowest_s:.2f} | {age_s:.1f} | {len(late)} | {len(watch.failed)}"
+                    print(f"| {kind} | {name} | {cells} | {cost.memory_mb:+.1f} | {cost.lines} |", flush=True)
+                    missed |= bool(late or watch.failed)
+                    live.judged_within(live.names, time.time(), 30.0)
+    return int(missed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
