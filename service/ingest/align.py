@@ -1,11 +1,4 @@
-"""Alignment of readings to the ticks of a feeder, and clock offsets of their sources.
-
-A reading with the stamp t that arrives at the wall time a has the delay ``a - t``: transmission time plus
-clock error. The median delay of a source, less that of all sources, is the negative offset of its clock if
-transmission times are equal. A longer transmission time looks like a clock that is behind.
-
-Readings of one source that arrive at one instant count once, with the newest stamp: a concentrator sends a
-backlog at once, and its age is not an offset.
+"""Alignment of readings to the ticks of a feeder.
 
 A tick is a multiple of the feeder's `tick_s`. A meter is available at a tick if its latest reading at or
 before it is younger than `max_age_s`; at short ticks a single lost reading has no effect. A tick is emitted
@@ -13,7 +6,8 @@ as soon as every source that is not silent has reported for it, and at the lates
 readings are late: counted, and used for the next tick if still fresh. Silence does not stop the ticks.
 
 The readings of a round are columns (`Readings`). Runs of readings in order, between two ticks, are placed
-together; any other reading is placed alone. The result does not depend on the way.
+together, and fastest a scan: one reading of each source. Any other reading is placed alone. The result does
+not depend on the way.
 
 The alignment has no clock. `now` is an argument (the wall clock) or follows from the readings
 (`Clock.EVENTS`: the latest time that at least half of the sources have reached, so that a few wrong clocks
@@ -30,146 +24,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import zip_longest
-from typing import Final
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices
 from gridsec.errors import InputInvalid, Problem
+from service.ingest.clock_offsets import ClockOffsets, rank
 from service.ingest.reading import COLUMNS, NO_SEQ, V_VOLT, Reading, Readings, T
-
-KEPT: Final = 64
-"""Newest arrivals of a source that its median delay uses."""
-FEWEST: Final = 16
-"""Smallest number of arrivals of a source for a measurable offset."""
-SOURCES: Final = 3
-"""Smallest number of sources with measurable delays for the median of all sources."""
-LEAST_S: Final = 0.5
-"""Smallest reported offset, s."""
-LEAST_TICKS: Final = 0.1
-"""Smallest reported offset, in ticks: readings up to this much after a tick belong to it."""
-SURE: Final = 4.0
-"""Smallest reported offset in standard errors of the median of a source's delays."""
-KEEPS: Final = 0.5
-"""Factor on the limits for an offset that is already reported (hysteresis)."""
-_NORMAL, _MEDIAN = 1.4826, 1.2533
-"""Standard deviation over median absolute deviation, and standard error of a median over that of a mean."""
-
-
-class ClockOffsets:
-    """Delays of the sources of one feeder.
-
-    sources: meters, and None for the busbar meter.
-    tick_s: interval of the ticks, s.
-    silence_s: time without an arrival after which the delays of a source are deleted, s. The service's clock
-        may be set meanwhile: delays of sources that no longer report would shift the median of all.
-    known: sources with enough delays at the latest measurement.
-    """
-
-    def __init__(self, sources: Iterable[str | None], tick_s: float, silence_s: float) -> None:
-        self._sources = tuple(sources)
-        size = len(self._sources)
-        self._index = {source: k for k, source in enumerate(self._sources)}
-        # Rings of the newest delays: column k holds `count[k]` of them, infinity elsewhere.
-        self._delays = np.full((KEPT, size), np.inf)
-        self._count = np.zeros(size, dtype=np.intp)
-        self._newest = np.full(size, KEPT - 1)
-        self._arrived = np.full(size, np.nan)
-        self._least = max(LEAST_S, LEAST_TICKS * tick_s)
-        self._silence = silence_s
-        self._reported = np.zeros(size, dtype=np.bool_)
-        self.known: frozenset[str | None] = frozenset()
-
-    def note(self, source: str | None, t: float, arrival: float) -> None:
-        """Add the delay of one reading. `source` is the meter, None for the busbar meter; times in Unix s."""
-        k = self._index[source]
-        self.note_all(np.array([k]), np.array([t]), np.array([arrival]))
-
-    def note_all(self, source: Ints, t: Floats, arrival: Floats) -> None:
-        """Add the delays of readings, (n,), grouped by source, those of each in the order of arrival."""
-        of, arrived, delay = source, arrival, arrival - t
-        again = source[1:] == source[:-1]
-        if again.any():
-            at = np.flatnonzero(np.concatenate(([True], ~again | (arrival[1:] != arrival[:-1]))))
-            of, arrived, delay = source[at], arrival[at], np.minimum.reduceat(delay, at)
-        # The first instant of a source may go on with its newest one.
-        same = self._arrived[of] == arrived
-        if same.any():
-            same[1:] &= of[1:] != of[:-1]
-            old = of[same]
-            newest = self._newest[old]
-            self._delays[newest, old] = np.minimum(self._delays[newest, old], delay[same])
-            of, arrived, delay = of[~same], arrived[~same], delay[~same]
-        if of.size:
-            place = (self._newest[of] + 1 + _rank(of)) % KEPT
-            self._delays[place, of] = delay
-            self._newest[of], self._arrived[of] = place, arrived
-            self._count += np.bincount(of, minlength=self._count.size)
-            np.minimum(self._count, KEPT, out=self._count)
-
-    def forget(self) -> None:
-        """Delete all delays: the wall clock was set."""
-        self._delete(np.ones(self._count.size, dtype=np.bool_))
-        self._reported[:] = False
-        self.known = frozenset()
-
-    def _delete(self, which: Bools) -> None:
-        self._delays[:, which] = np.inf
-        self._count[which] = 0
-        self._arrived[which] = np.nan
-
-    def measured(self, now: float) -> Mapping[str | None, float]:
-        """Return the measurable offsets, s; positive if the clock is ahead.
-
-        Delays of sources that are silent at `now`, Unix s, are deleted.
-        """
-        gone = now - self._arrived > self._silence
-        if gone.any():
-            self._delete(gone)
-        enough = np.flatnonzero(self._count >= FEWEST)
-        if enough.size < SOURCES:
-            self._reported[:] = False
-            self.known = frozenset()
-            return {}
-        self.known = frozenset(self._sources[k] for k in enough)
-        middle = _medians(self._delays[:, enough], self._count[enough])
-        off = float(np.median(middle)) - middle
-        # Half of `least` is the lower bound of all limits and is cheaper.
-        maybe = np.flatnonzero(np.abs(off) >= KEEPS * self._least)
-        found = {
-            int(enough[k]): float(off[k])
-            for k in maybe
-            if abs(off[k]) >= self._limit(int(enough[k]), float(middle[k]))
-        }
-        self._reported[:] = False
-        self._reported[list(found)] = True
-        return {self._sources[k]: offset for k, offset in found.items()}
-
-    def _limit(self, source: int, middle: float) -> float:
-        """Smallest reported offset of a source, s."""
-        delays = self._delays[:, source]
-        delays = delays[np.isfinite(delays)]
-        spread = _NORMAL * float(np.median(np.abs(delays - middle)))
-        limit = max(self._least, SURE * _MEDIAN * spread / math.sqrt(delays.size))
-        return KEEPS * limit if self._reported[source] else limit
-
-
-def _medians(columns: Floats, count: Ints) -> Floats:
-    """Median of the `count` finite numbers of each column; all others are infinite."""
-    ordered = np.sort(columns, axis=0)
-    each = np.arange(count.size)
-    return np.asarray((ordered[(count - 1) // 2, each] + ordered[count // 2, each]) / 2.0)
-
-
-def _rank(grouped: Ints) -> Ints:
-    """Position of each element among the equal ones before it; equal elements are side by side."""
-    again = grouped[1:] == grouped[:-1]
-    if not again.any():
-        return np.zeros(grouped.size, dtype=np.intp)
-    each = np.arange(grouped.size)
-    begins = np.concatenate(([True], ~again))
-    return each - np.maximum.accumulate(np.where(begins, each, 0))
-
 
 HELD_PER_SOURCE = 512
 """Largest number of readings of a source ahead of the ticks; further ones overflow."""
@@ -342,8 +203,8 @@ class Aligner:
         size = len(self.meters) + 1
         self._index: dict[str | None, int] = {source: k for k, source in enumerate((*self.meters, None))}
         self._each = np.arange(size)
-        self._scans: dict[bytes, list[_Scan]] = {}
-        # (5, p + 1): newest reading of each source until the end of the last tick; its time is -inf without one.
+        self._scans: dict[bytes, _Scans] = {}
+        # (5, p + 1): newest reading of each source until the end of the last tick; its time is -inf if none.
         self._served = np.full((COLUMNS, size), -np.inf)
         # (slots, 5, p + 1): later readings by time; the time of an empty slot is infinite.
         self._ahead = _empty(SLOTS, size)
@@ -390,15 +251,13 @@ class Aligner:
         ticks: list[Tick] = []
         before, refused, clock_off = self.counts.copy(), len(self._refused), list[int]()
         latest = np.maximum(np.maximum.accumulate(readings.arrival), self._latest)
-        scans = self._scans_of(readings.source) if self.rules.clock is Clock.WALL else []
+        scans = self._scans_of(readings.source) if self.rules.clock is Clock.WALL else None
         while begin < size:
             end = begin
-            if scans:
+            if scans is not None:
                 self._latest = float(latest[begin])
                 ticks.extend(self._emit_ticks(self._latest))
-                while scans[0].end <= begin:
-                    scans = scans[1:]
-                end = self._place_scan(readings, latest, begin, scans[0]) or self._run(readings, latest, begin)
+                end = self._place_scan(readings, latest, begin, scans) or self._run(readings, latest, begin)
             if end - begin >= ALONE:
                 self._latest = float(latest[end - 1])
                 ticks.extend(self._emit_ticks(self._latest))
@@ -468,7 +327,7 @@ class Aligner:
         before, room = self._last_t[by_source], HELD_PER_SOURCE - self._held()[by_source]
         if repeated.any():
             before[1:][repeated] = by_t[:-1][repeated]
-            room -= _rank(by_source)
+            room -= rank(by_source)
         plain, fresh = np.empty((2, end), dtype=np.bool_)
         fresh[order] = by_t > before
         plain[order] = (by_t >= before) & (room > 0)
@@ -499,26 +358,25 @@ class Aligner:
         rules = self.rules
         return min(self._next_t + rules.grace_s, self._time(self._number() + rules.backlog))
 
-    def _scans_of(self, source: Ints) -> list[_Scan]:
-        """Scans of readings, in order; those of a concentrator repeat and are kept."""
+    def _scans_of(self, source: Ints) -> _Scans:
+        """Scans of readings; those of a concentrator repeat and are kept."""
         key = source.tobytes()
         found = self._scans.get(key)
         if found is None:
             if len(self._scans) >= SCANS_KEPT:
                 self._scans.clear()
-            found = self._scans[key] = _scans(source)
+            found = self._scans[key] = _Scans(source)
         return found
 
-    def _place_scan(self, readings: Readings, latest: Floats, begin: int, scan: _Scan) -> int:
-        """Place the rest of a scan, if it is a run of accepted readings; return its end, otherwise 0.
+    def _place_scan(self, readings: Readings, latest: Floats, begin: int, scans: _Scans) -> int:
+        """Place the scan from `begin` if it is a run of accepted readings; return its end, otherwise 0.
 
         latest (n,): as for `_run`.
         """
-        end, rules = scan.end, self.rules
+        (end, at), rules = scans.at(begin, self._count.size), self.rules
         size, last = end - begin, float(latest[end - 1])
         if size < ALONE or last >= self._run_end() or self._most + 2 > HELD_PER_SOURCE:
             return 0
-        at: slice | Ints = scan.at if begin == scan.begin else readings.source[begin:end]
         arrival, values = readings.arrival[begin:end], readings.values[:, begin:end]
         t = values[T]
         if not t.min() > self._end or not np.abs(t - arrival).max() <= rules.max_skew_s:
@@ -566,7 +424,7 @@ class Aligner:
     def _place_run(self, readings: Readings, at: Ints, late: Bools) -> None:
         """Place readings of a run, grouped by source; `late` are those that the last tick has missed."""
         source, arrival, values = readings.source[at], readings.arrival[at], readings.values[:, at]
-        slot = self._count[source] + _rank(source)
+        slot = self._count[source] + rank(source)
         self._clocks.note_all(source, values[T], arrival)
         self._count_gaps(source, readings.seq[at])
         self._extend(int(slot.max()) + 1)
@@ -627,7 +485,7 @@ class Aligner:
         # A time stamp in the future does not prove that the meter still reports then.
         self._last_heard[source] = t if now is None or self.rules.clock is Clock.EVENTS else now
         if self._next is not None:
-            self._wait_for(source, self._next)
+            self._wait_for(source)
         if late:
             return ReadingOutcome.LATE
         return ReadingOutcome.ACCEPTED if in_order else ReadingOutcome.OUT_OF_ORDER
@@ -686,7 +544,7 @@ class Aligner:
         if not numbered.any():
             return
         source, seq = source[numbered], seq[numbered]
-        before = np.where(_rank(source) > 0, np.concatenate(([NO_SEQ], seq[:-1])), self._seq[source])
+        before = np.where(rank(source) > 0, np.concatenate(([NO_SEQ], seq[:-1])), self._seq[source])
         gap = seq - before - 1
         self.lost += int(gap[(before != NO_SEQ) & (gap > 0) & (gap <= GAP_MAX)].sum())
         self._seq[source] = seq
@@ -888,13 +746,13 @@ class Aligner:
             times = set(self._times(len(self.meters)))
             self._phases = {t: phases for t, phases in self._phases.items() if t in times}
 
-    def _wait_for(self, source: int, number: int) -> None:
-        """Wait for a source at a tick if it is not silent and has not reported for it."""
+    def _wait_for(self, source: int) -> None:
+        """Wait for a source at the next tick if it is not silent and has not reported for it."""
         last_t = self._last_t[source : source + 1]
-        wait = not last_t[0] > self._time(number - 1) + self.rules.lead_s
+        wait = not last_t[0] > self._end
         if wait:
             heard = self._last_heard[source : source + 1]
-            wait = not self._silent_for(last_t, self._time(number), heard)[0] > 0.0
+            wait = not self._silent_for(last_t, self._next_t, heard)[0] > 0.0
         self._waits += int(wait) - int(self._waiting[source])
         self._waiting[source] = wait
 
@@ -941,28 +799,29 @@ def _empty(slots: int, sources: int) -> Floats:
     return table
 
 
-@dataclass(frozen=True, slots=True)
-class _Scan:
-    """Successive readings of different sources."""
+class _Scans:
+    """Scans of readings: successive readings of different sources.
 
-    begin: int
-    end: int
-    at: slice | Ints  # their sources
+    source (n,): sources of the readings.
+    """
 
+    def __init__(self, source: Ints) -> None:
+        self._source = source
+        order = source.argsort(kind="stable")
+        again = source[order[1:]] == source[order[:-1]]
+        # Position of the last reading of the same source.
+        self._before = np.full(source.size, -1)
+        self._before[order[1:][again]] = order[:-1][again]
+        self._found: dict[int, tuple[int, slice | Ints]] = {}
 
-def _scans(source: Ints) -> list[_Scan]:
-    """Scans of readings, each as long as possible, in order."""
-    order = source.argsort(kind="stable")
-    again = source[order[1:]] == source[order[:-1]]
-    # Position of the last reading of the same source.
-    before = np.full(source.size, -1)
-    before[order[1:][again]] = order[:-1][again]
-    found, begin = [], 0
-    while begin < source.size:
-        repeated = before[begin:] >= begin
-        end = begin + int(repeated.argmax()) if any_of(repeated) else source.size
-        first, each = int(source[begin]), source[begin:end]
-        in_order = all_of(each == np.arange(first, first + each.size))
-        found.append(_Scan(begin, end, slice(first, first + each.size) if in_order else each))
-        begin = end
-    return found
+    def at(self, begin: int, most: int) -> tuple[int, slice | Ints]:
+        """Return the end of the longest scan from a position, and its sources; `most` is their number."""
+        found = self._found.get(begin)
+        if found is None:
+            repeated = self._before[begin : begin + most] >= begin
+            end = begin + int(repeated.argmax()) if any_of(repeated) else begin + repeated.size
+            first, each = int(self._source[begin]), self._source[begin:end]
+            in_order = all_of(each == np.arange(first, first + each.size))
+            found = end, slice(first, first + each.size) if in_order else each
+            self._found[begin] = found
+        return found
