@@ -89,8 +89,8 @@ class Wire:
     prefix: str = "gridsec"  # first chunks of every key, without a final slash
     max_bytes: int = 256 * 1024  # size of the largest accepted payload, bytes
     keys: MeterKeys | None = None  # keys of meters; None accepts readings without signature
-    # Feeder and source of the zenoh keys of single readings so far.
-    places: dict[str, tuple[str, int]] = field(default_factory=dict)
+    # Feeder and source of single JSON readings so far, by zenoh key and encoding.
+    places: dict[tuple[str, str], tuple[str, int]] = field(default_factory=dict)
 
     def decode(
         self,
@@ -145,11 +145,15 @@ class Wire:
             bad.extend(refused)
             parts.setdefault(feeder, []).extend(readings)
 
+        places = self.places
         for sample in samples:
-            place = self._place_of(sample)
+            key, payload, encoding, _, size, _ = sample
+            place = places.get((key, encoding)) if size <= self.max_bytes else None
+            if place is None:
+                place = self._place_of(sample)
             if place is not None:
                 try:
-                    raw = _decode_one(sample.payload)
+                    raw = _decode_one(payload)
                 except (msgspec.MsgspecError, RecursionError):
                     pass
                 else:
@@ -174,12 +178,11 @@ class Wire:
         """Feeder and source of a payload that may be a valid single JSON reading; None for all others."""
         if self.keys is not None or sample.encoding not in JSON_ENCODINGS or sample.size > self.max_bytes:
             return None
-        place = self.places.get(sample.key)
-        if place is None:
-            source = source_of(sample.key, self.prefix, self.known)
-            if isinstance(source, BadReading) or source.concentrator is not None:
-                return None
-            place = self.places[sample.key] = (source.feeder, self.known[source.feeder].index[source.meter])
+        source = source_of(sample.key, self.prefix, self.known)
+        if isinstance(source, BadReading) or source.concentrator is not None:
+            return None
+        place = source.feeder, self.known[source.feeder].index[source.meter]
+        self.places[sample.key, sample.encoding] = place
         return place
 
     def _finish(
