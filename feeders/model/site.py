@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Final
 
@@ -272,33 +272,44 @@ def _bounded(site: Site, powers: Registered) -> bool:
 def _intervals(model: LoadModel, metered: Floats, known: Bools) -> Registered:
     """Intervals of the powers, see `feeders.model.site.to_frame`; the declared range where not `known`."""
     p = np.where(known, metered, 0.5 * (model.load_peak - model.pv_peak))
-    excess = np.maximum(p - model.load_peak, 0.0) + np.maximum(-p - model.pv_peak, 0.0)
-    doubt = np.minimum(2.0 * excess, np.abs(p))
-    p_error = np.where(known, model.p_fraction * np.abs(p) + model.p_floor + doubt, model.p_unread)
+    size = np.abs(p)
+    own = model.p_fraction * size + model.p_floor
+    beyond = np.isfinite(metered) & ~known
+    if any_of((p > model.load_peak) | (-p > model.pv_peak)):
+        excess = np.maximum(p - model.load_peak, 0.0) + np.maximum(-p - model.pv_peak, 0.0)
+        own += np.minimum(2.0 * excess, size)
+        beyond |= known & (excess > 0.0)
+    else:
+        excess = np.zeros(p.size)
+    p_error = np.where(known, own, model.p_unread)
     low = np.maximum(p - p_error, 0.0)
     most = np.minimum(p + p_error + model.pv_peak, model.load_peak)
     high = np.maximum(np.maximum(most, p + p_error), 0.0)
     q_low = low * model.tan_min - model.q_floor
     q_high = high * model.tan_max + model.q_floor
     q_error = 0.5 * (q_high - q_low)
-    beyond = (known & (excess > 0.0)) | (np.isfinite(metered) & ~known)
-    origin = np.where(known, PowerOrigin.READ, PowerOrigin.UNREAD)
+    origin = np.where(known, _READ, _UNREAD)
+    if any_of(beyond):
+        origin[beyond] = PowerOrigin.BEYOND
     return Registered(
         p=p,
         p_error=p_error,
         q=0.5 * (q_low + q_high),
         q_error=np.where(known, q_error, np.minimum(q_error, model.q_unread)),
         known=known,
-        origin=np.where(beyond, PowerOrigin.BEYOND, origin).astype(np.intp),
+        origin=origin,
         excess=excess,
     )
+
+
+_READ, _UNREAD = np.intp(PowerOrigin.READ), np.intp(PowerOrigin.UNREAD)
 
 
 # An absurd reading is evidence too, but its square must stay finite.
 ABSURD_PU = 100.0
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Site(Equipment):
     """Feeder for monitoring and simulation. N customers, p meters, b + 1 buses.
 
@@ -314,15 +325,26 @@ class Site(Equipment):
     nominal_volt: Floats
     forecast: Forecast | None = None  # forecast of unread powers; None: they have their range only
 
-    @property
+    @cached_property
     def customer_volt(self) -> Floats:
         """1 pu at every customer, V, (N,)."""
-        return np.asarray(self.base_volt[self.feeder.bus])
+        return frozen(self.base_volt[self.feeder.bus])
 
-    @property
+    @cached_property
     def customer_nominal(self) -> Floats:
         """Nominal voltage of every customer, V, (N,)."""
-        return np.asarray(self.nominal_volt[self.feeder.bus])
+        return frozen(self.nominal_volt[self.feeder.bus])
+
+    @cached_property
+    def meter_volt(self) -> Floats:
+        """1 pu at every meter, V, (p,)."""
+        return frozen(self.customer_volt[self.meters])
+
+    @cached_property
+    def meter_limits(self) -> tuple[Floats, Floats]:
+        """Lowest and highest permitted voltage at every meter, V, (p,)."""
+        limits, nominal = self.tables.meta.limits, self.customer_nominal[self.meters]
+        return frozen(limits.v_min_pu * nominal), frozen(limits.v_max_pu * nominal)
 
     @property
     def spanning(self) -> Feeder | ThreePhaseFeeder:
@@ -529,9 +551,9 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
     load is P itself. The frame has centre and half-width of that interval. `q_std_kvar` of a customer without
     a meter narrows it as `p_std_kw` does.
     """
-    base_volt, base_kva, model = site.customer_volt[site.meters], site.feeder.base_kva, site.loads
+    base_kva, model = site.feeder.base_kva, site.loads
     seen = np.isfinite(snapshot.v_volt)
-    v = np.clip(snapshot.v_volt / base_volt, -ABSURD_PU, ABSURD_PU)
+    v = np.minimum(np.maximum(snapshot.v_volt / site.meter_volt, -ABSURD_PU), ABSURD_PU)
     y = np.where(seen, v * np.abs(v), np.nan)
     v0_squared, v0_phases = _busbar(snapshot.v0_volt, site.feeder.base_volt)
     metered = np.full(model.load_peak.size, np.nan)
@@ -540,10 +562,12 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
     if aged is not None:
         metered[aged.useless] = np.nan
     load = registered(site, metered)
-    q_net = np.full(model.load_peak.size, np.nan)
-    q_net[site.meters] = -snapshot.q_kvar / base_kva
-    q_net[~(np.abs(q_net) <= model.credible)] = np.nan
-    size = np.where(np.isnan(q_net), 0.0, np.abs(q_net))
+    q_net, size = np.full(model.load_peak.size, np.nan), np.zeros(model.load_peak.size)
+    if not all_of(np.isnan(snapshot.q_kvar)):
+        q_net[site.meters] = -snapshot.q_kvar / base_kva
+        told = np.abs(q_net) <= model.credible
+        q_net[~told] = np.nan
+        size[told] = np.abs(q_net[told])
     frame = Frame(
         t=snapshot.t,
         y=y,
@@ -566,9 +590,11 @@ def to_frame(site: Site, snapshot: Snapshot) -> Frame:
 
 def _busbar(v0_volt: Floats | float, base_volt: float) -> tuple[float, Floats | None]:
     """Squared busbar voltage, pu: the mean of the phases, and in three phases that of each."""
-    with np.errstate(invalid="ignore"):
-        v0 = np.clip(np.where(np.isfinite(v0_volt), v0_volt, np.nan) / base_volt, 0.0, ABSURD_PU) ** 2
-    return (float(v0), None) if v0.ndim == 0 else (float(v0.mean()), v0)
+    if not isinstance(v0_volt, np.ndarray):
+        one = min(max(v0_volt / base_volt, 0.0), ABSURD_PU) if math.isfinite(v0_volt) else math.nan
+        return one * one, None
+    v0 = np.clip(np.where(np.isfinite(v0_volt), v0_volt, np.nan) / base_volt, 0.0, ABSURD_PU) ** 2
+    return float(v0.mean()), v0
 
 
 # --- building -----------------------------------------------------------------------------------

@@ -15,9 +15,10 @@ clock of the verdict begins there, as that of the alarm does.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
+from gridsec.arrays import changed
 from gridsec.interface import Cause, Decision
 from service.alarms.state_machine import AlarmKind, AlarmRules
 
@@ -78,34 +79,34 @@ def advance(display: Display[T] | None, rules: AlarmRules, tick: T) -> Display[T
         after = _undecided(display, rules, tick)
     else:
         after = _decided(display, rules, tick)
-    return replace(after, t=tick.t)
+    return changed(after, t=tick.t)
 
 
 def _decided(display: Display[T], rules: AlarmRules, tick: T) -> Display[T]:
     """The display after a tick with an answer."""
-    display = replace(display, undecided_since=None)
+    display = changed(display, undecided_since=None)
     if tick.verdict is display.verdict:
-        display = replace(display, newest=tick)
+        display = changed(display, newest=tick)
         if display.confirmed:
-            return replace(display, answer=None, held=False)
+            return changed(display, answer=None, held=False)
     if display.answer is not tick.verdict:
-        display = replace(display, answer=tick.verdict, onset=tick.t, lasted_s=0.0)
+        display = changed(display, answer=tick.verdict, onset=tick.t, lasted_s=0.0)
     else:
         display = _ticked(display, tick)
-    display = replace(display, held=False)
+    display = changed(display, held=False)
     kind = AlarmKind.METER_MANIPULATED
     delay = rules.on(kind) if tick.verdict is Decision.ATTACKED else rules.off(kind)
     if display.lasted_s < delay:
         return display
     since = display.since if tick.verdict is display.verdict else display.onset
-    return replace(display, newest=tick, since=since, answer=None, confirmed=True)
+    return changed(display, newest=tick, since=since, answer=None, confirmed=True)
 
 
 def _undecided(display: Display[T], rules: AlarmRules, tick: T) -> Display[T]:
     """The display after a tick without an answer."""
     since = tick.t if display.undecided_since is None else display.undecided_since
     # The answer of a tick counts until the next one.
-    display = replace(_ticked(display, tick), held=True, undecided_since=since)
+    display = changed(_ticked(display, tick), held=True, undecided_since=since)
     lasted = tick.t - since
     due = lasted >= rules.on(AlarmKind.UNDECIDED) and (tick.cause not in _UNHEARD or lasted > rules.silence_s)
     if display.verdict is not Decision.UNDECIDED:
@@ -113,13 +114,13 @@ def _undecided(display: Display[T], rules: AlarmRules, tick: T) -> Display[T]:
             return display
         # A waiting ATTACKED lasts, as the pending alarm does.
         answer = None if display.answer is Decision.CLEAN else display.answer
-        return replace(display, newest=tick, since=since, answer=answer)
+        return changed(display, newest=tick, since=since, answer=answer)
     starts_again = due and display.answer is Decision.CLEAN
-    return replace(display, newest=tick, answer=None if starts_again else display.answer)
+    return changed(display, newest=tick, answer=None if starts_again else display.answer)
 
 
 def _ticked(display: Display[T], tick: T) -> Display[T]:
     """The display with the clock of the waiting answer moved to this tick, unless it stands still."""
     if display.answer is None or display.held or tick.skipped:
         return display
-    return replace(display, lasted_s=display.lasted_s + tick.t - display.t)
+    return changed(display, lasted_s=display.lasted_s + tick.t - display.t)

@@ -154,6 +154,7 @@ class FeederCommissioning:
         self._t: float | None = None
         self._saved_t: float | None = None
         self._happened: tuple[CommissioningEvent, ...] = ()
+        self._reported = LearningReport()
 
     @property
     def learner(self) -> BiasLearning | None:
@@ -162,7 +163,7 @@ class FeederCommissioning:
 
     def install(self, watcher: DesignedEstimator) -> None:
         """Install a finished design, and the stored state if it fits."""
-        self._watcher = watcher
+        self._watcher, self._reported = watcher, LearningReport()
         if self.learner is None:
             self.known = None
         elif self.known is None and self._kept is not None:
@@ -263,8 +264,12 @@ class FeederCommissioning:
         found = self._found(known)
         if known is None or found is None:
             return LearningReport()
+        last = self._reported
+        if found.state is last.states and found.reason is last.reasons and not last.stalled:
+            return last
         if LearningState.STALLED not in found.state:
-            return LearningReport(found.state, found.reason, found.expected_s)
+            self._reported = LearningReport(found.state, found.reason, found.expected_s)
+            return self._reported
         gathered = np.zeros(len(found.state)) if known.learning is None else known.learning.time_s
         stalled = tuple(
             StalledMeter(meter, found.reason[k], float(gathered[k]))

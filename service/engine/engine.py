@@ -56,7 +56,7 @@ from service.ingest.queues import Inbox, Sample
 from service.ingest.reading import BadReading, BadReason, Known, Reading, Readings, head_of
 from service.metrics import Metrics
 from service.report.feeder_info import Ownership
-from service.report.report import BUSBAR, FeederReport
+from service.report.report import BUSBAR, Kept
 from service.report.tick_state import TickState
 from service.store import Rejected, Store
 from service.store.committer import Committer, Executor, Wish, alarm_key, incident_key, inline
@@ -585,7 +585,7 @@ class Engine:
         """Latest wall time of the next tick, Unix s; infinite if only readings can cause one."""
         return min(self._wakes.values(), default=math.inf)
 
-    def _history(self, state: TickState) -> tuple[FeederReport, ...]:
+    def _history(self, state: TickState) -> tuple[Kept, ...]:
         """The part of the report that the history keeps, if any: the store selects by the same rule."""
         now = mark(state)
         if not worth_keeping(self._marks.get(state.feeder), now, self.store.history_rules):
@@ -725,7 +725,7 @@ class Engine:
         reason = f"{BadReason.CLOCK_OFF}: t = {reading.t:.3f} is too far from now"
         return Rejected(arrival, key, reason, head_of(reading).encode())
 
-    def _count_stored(self, reports: tuple[FeederReport, ...]) -> None:
+    def _count_stored(self, reports: tuple[Kept, ...]) -> None:
         for report in reports:
             self._count_delay(report.feeder, report.t)
 

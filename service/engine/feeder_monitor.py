@@ -494,9 +494,9 @@ class FeederMonitor:
         since = before.since if before is not None and goes_on else state.t
         # After the clock was set back, an earlier time of measurement would be in the future.
         measured = (last if last is None or last <= state.t else None) if state.model_only else state.t
-        state = replace(state, revision=self.revision, t_measured=measured, since=since)
+        state = state.completed(revision=self.revision, t_measured=measured, since=since)
         display = displayed.advance(self._display, self._alarm_rules, state)
-        return replace(state, displayed=(display.newest, display.since)), display
+        return state.completed(displayed=(display.newest, display.since)), display
 
     def _judge(self, tick: Tick) -> TickState:
         if self.shed:

@@ -1,11 +1,4 @@
-"""Alignment of readings to the ticks of a feeder, and clock offsets of their sources.
-
-A reading with the stamp t that arrives at the wall time a has the delay ``a - t``: transmission time plus
-clock error. The median delay of a source, less that of all sources, is the negative offset of its clock if
-transmission times are equal. A longer transmission time looks like a clock that is behind.
-
-Readings of one source that arrive at one instant count once, with the newest stamp: a concentrator sends a
-backlog at once, and its age is not an offset.
+"""Alignment of readings to the ticks of a feeder.
 
 A tick is a multiple of the feeder's `tick_s`. A meter is available at a tick if its latest reading at or
 before it is younger than `max_age_s`; at short ticks a single lost reading has no effect. A tick is emitted
@@ -13,7 +6,8 @@ as soon as every source that is not silent has reported for it, and at the lates
 readings are late: counted, and used for the next tick if still fresh. Silence does not stop the ticks.
 
 The readings of a round are columns (`Readings`). Runs of readings in order, between two ticks, are placed
-together; any other reading is placed alone. The result does not depend on the way.
+together, and fastest a scan: one reading of each source. Any other reading is placed alone. The result does
+not depend on the way.
 
 The alignment has no clock. `now` is an argument (the wall clock) or follows from the readings
 (`Clock.EVENTS`: the latest time that at least half of the sources have reached, so that a few wrong clocks
@@ -30,146 +24,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import zip_longest
-from typing import Final
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices
 from gridsec.errors import InputInvalid, Problem
+from service.ingest.clock_offsets import ClockOffsets, rank
 from service.ingest.reading import COLUMNS, NO_SEQ, V_VOLT, Reading, Readings, T
-
-KEPT: Final = 64
-"""Newest arrivals of a source that its median delay uses."""
-FEWEST: Final = 16
-"""Smallest number of arrivals of a source for a measurable offset."""
-SOURCES: Final = 3
-"""Smallest number of sources with measurable delays for the median of all sources."""
-LEAST_S: Final = 0.5
-"""Smallest reported offset, s."""
-LEAST_TICKS: Final = 0.1
-"""Smallest reported offset, in ticks: readings up to this much after a tick belong to it."""
-SURE: Final = 4.0
-"""Smallest reported offset in standard errors of the median of a source's delays."""
-KEEPS: Final = 0.5
-"""Factor on the limits for an offset that is already reported (hysteresis)."""
-_NORMAL, _MEDIAN = 1.4826, 1.2533
-"""Standard deviation over median absolute deviation, and standard error of a median over that of a mean."""
-
-
-class ClockOffsets:
-    """Delays of the sources of one feeder.
-
-    sources: meters, and None for the busbar meter.
-    tick_s: interval of the ticks, s.
-    silence_s: time without an arrival after which the delays of a source are deleted, s. The service's clock
-        may be set meanwhile: delays of sources that no longer report would shift the median of all.
-    known: sources with enough delays at the latest measurement.
-    """
-
-    def __init__(self, sources: Iterable[str | None], tick_s: float, silence_s: float) -> None:
-        self._sources = tuple(sources)
-        size = len(self._sources)
-        self._index = {source: k for k, source in enumerate(self._sources)}
-        # Rings of the newest delays: column k holds `count[k]` of them, infinity elsewhere.
-        self._delays = np.full((KEPT, size), np.inf)
-        self._count = np.zeros(size, dtype=np.intp)
-        self._newest = np.full(size, KEPT - 1)
-        self._arrived = np.full(size, np.nan)
-        self._least = max(LEAST_S, LEAST_TICKS * tick_s)
-        self._silence = silence_s
-        self._reported = np.zeros(size, dtype=np.bool_)
-        self.known: frozenset[str | None] = frozenset()
-
-    def note(self, source: str | None, t: float, arrival: float) -> None:
-        """Add the delay of one reading. `source` is the meter, None for the busbar meter; times in Unix s."""
-        k = self._index[source]
-        self.note_all(np.array([k]), np.array([t]), np.array([arrival]))
-
-    def note_all(self, source: Ints, t: Floats, arrival: Floats) -> None:
-        """Add the delays of readings, (n,), grouped by source, those of each in the order of arrival."""
-        of, arrived, delay = source, arrival, arrival - t
-        again = source[1:] == source[:-1]
-        if again.any():
-            at = np.flatnonzero(np.concatenate(([True], ~again | (arrival[1:] != arrival[:-1]))))
-            of, arrived, delay = source[at], arrival[at], np.minimum.reduceat(delay, at)
-        # The first instant of a source may go on with its newest one.
-        same = self._arrived[of] == arrived
-        if same.any():
-            same[1:] &= of[1:] != of[:-1]
-            old = of[same]
-            newest = self._newest[old]
-            self._delays[newest, old] = np.minimum(self._delays[newest, old], delay[same])
-            of, arrived, delay = of[~same], arrived[~same], delay[~same]
-        if of.size:
-            place = (self._newest[of] + 1 + _rank(of)) % KEPT
-            self._delays[place, of] = delay
-            self._newest[of], self._arrived[of] = place, arrived
-            self._count += np.bincount(of, minlength=self._count.size)
-            np.minimum(self._count, KEPT, out=self._count)
-
-    def forget(self) -> None:
-        """Delete all delays: the wall clock was set."""
-        self._delete(np.ones(self._count.size, dtype=np.bool_))
-        self._reported[:] = False
-        self.known = frozenset()
-
-    def _delete(self, which: Bools) -> None:
-        self._delays[:, which] = np.inf
-        self._count[which] = 0
-        self._arrived[which] = np.nan
-
-    def measured(self, now: float) -> Mapping[str | None, float]:
-        """Return the measurable offsets, s; positive if the clock is ahead.
-
-        Delays of sources that are silent at `now`, Unix s, are deleted.
-        """
-        gone = now - self._arrived > self._silence
-        if gone.any():
-            self._delete(gone)
-        enough = np.flatnonzero(self._count >= FEWEST)
-        if enough.size < SOURCES:
-            self._reported[:] = False
-            self.known = frozenset()
-            return {}
-        self.known = frozenset(self._sources[k] for k in enough)
-        middle = _medians(self._delays[:, enough], self._count[enough])
-        off = float(np.median(middle)) - middle
-        # Half of `least` is the lower bound of all limits and is cheaper.
-        maybe = np.flatnonzero(np.abs(off) >= KEEPS * self._least)
-        found = {
-            int(enough[k]): float(off[k])
-            for k in maybe
-            if abs(off[k]) >= self._limit(int(enough[k]), float(middle[k]))
-        }
-        self._reported[:] = False
-        self._reported[list(found)] = True
-        return {self._sources[k]: offset for k, offset in found.items()}
-
-    def _limit(self, source: int, middle: float) -> float:
-        """Smallest reported offset of a source, s."""
-        delays = self._delays[:, source]
-        delays = delays[np.isfinite(delays)]
-        spread = _NORMAL * float(np.median(np.abs(delays - middle)))
-        limit = max(self._least, SURE * _MEDIAN * spread / math.sqrt(delays.size))
-        return KEEPS * limit if self._reported[source] else limit
-
-
-def _medians(columns: Floats, count: Ints) -> Floats:
-    """Median of the `count` finite numbers of each column; all others are infinite."""
-    ordered = np.sort(columns, axis=0)
-    each = np.arange(count.size)
-    return np.asarray((ordered[(count - 1) // 2, each] + ordered[count // 2, each]) / 2.0)
-
-
-def _rank(grouped: Ints) -> Ints:
-    """Position of each element among the equal ones before it; equal elements are side by side."""
-    again = grouped[1:] == grouped[:-1]
-    if not again.any():
-        return np.zeros(grouped.size, dtype=np.intp)
-    each = np.arange(grouped.size)
-    begins = np.concatenate(([True], ~again))
-    return each - np.maximum.accumulate(np.where(begins, each, 0))
-
 
 HELD_PER_SOURCE = 512
 """Largest number of readings of a source ahead of the ticks; further ones overflow."""
@@ -316,6 +177,9 @@ class Placed:
 SLOTS = 4
 """Readings of each source that the table holds at first; it grows to `HELD_PER_SOURCE`."""
 
+SCANS_KEPT = 32
+"""Number of orders of sources with kept scans, for each feeder."""
+
 ALONE = 8
 """Readings placed one by one after a shorter run: the fixed cost of a run is that of about as many."""
 
@@ -339,15 +203,22 @@ class Aligner:
         size = len(self.meters) + 1
         self._index: dict[str | None, int] = {source: k for k, source in enumerate((*self.meters, None))}
         self._each = np.arange(size)
-        # (5, slots, p + 1): held readings of each source by time; the time of an empty slot is infinite.
-        self._held = _empty(SLOTS, size)
-        self._phases: dict[float, tuple[float, ...]] = {}
+        self._scans: dict[bytes, _Scans] = {}
+        # (5, p + 1): newest reading of each source until the end of the last tick; its time is -inf if none.
+        self._served = np.full((COLUMNS, size), -np.inf)
+        # (slots, 5, p + 1): later readings by time; the time of an empty slot is infinite.
+        self._ahead = _empty(SLOTS, size)
+        # Number of later readings of each source, and the largest one.
         self._count = np.zeros(size, dtype=np.intp)
+        self._most = 0
+        self._phases: dict[float, tuple[float, ...]] = {}
         self._last_t, self._last_heard, self._last_used = np.full((3, size), -np.inf)
         self._seq = np.full(size, NO_SEQ, dtype=np.int64)
         self._waiting = np.zeros(size, dtype=np.bool_)
         self._waits = 0
         self._next: int | None = None
+        # Time of the next tick, and the end of the last one: readings until then are late, Unix s.
+        self._next_t, self._end = math.inf, -math.inf
         self._first: int | None = None
         self._resumed = -math.inf
         self._refused: list[Reading] = []
@@ -380,12 +251,13 @@ class Aligner:
         ticks: list[Tick] = []
         before, refused, clock_off = self.counts.copy(), len(self._refused), list[int]()
         latest = np.maximum(np.maximum.accumulate(readings.arrival), self._latest)
+        scans = self._scans_of(readings.source) if self.rules.clock is Clock.WALL else None
         while begin < size:
             end = begin
-            if self.rules.clock is Clock.WALL:
+            if scans is not None:
                 self._latest = float(latest[begin])
                 ticks.extend(self._emit_ticks(self._latest))
-                end = self._run(readings, latest, begin)
+                end = self._place_scan(readings, latest, begin, scans) or self._run(readings, latest, begin)
             if end - begin >= ALONE:
                 self._latest = float(latest[end - 1])
                 ticks.extend(self._emit_ticks(self._latest))
@@ -415,7 +287,7 @@ class Aligner:
     ) -> tuple[ReadingOutcome, list[Tick]]:
         # A reading that waited in the queue arrived before the present time; the clock was not set back.
         self._latest = max(self._latest, now)
-        ticks = list(self._emit_ticks(self._latest))
+        ticks = self._emit_ticks(self._latest)
         if self.rules.clock is Clock.EVENTS:
             self._hear(values[T], source)
             ticks.extend(self._emit_ticks(self._latest))
@@ -443,34 +315,33 @@ class Aligner:
         latest (n,): newest arrival up to each reading, Unix s. Nothing is placed if the run is shorter than
         `ALONE`.
         """
-        rules, number = self.rules, self._number()
-        latest = latest[begin:]
+        rules, latest = self.rules, latest[begin:]
         # From the end of the grace, and from where the backlog ends, a tick may come before a reading.
-        limit = min(self._time(number) + rules.grace_s, self._time(number + rules.backlog))
+        limit = self._run_end()
         end = max(1, int(latest.searchsorted(limit)))
         source, arrival = readings.source[begin : begin + end], readings.arrival[begin : begin + end]
         t = readings.values[T, begin : begin + end]
         order = source.argsort(kind="stable")
         by_source, by_t = source[order], t[order]
         repeated = by_source[1:] == by_source[:-1]
-        before, room = self._last_t[by_source], HELD_PER_SOURCE - self._count[by_source]
+        before, room = self._last_t[by_source], HELD_PER_SOURCE - self._held()[by_source]
         if repeated.any():
             before[1:][repeated] = by_t[:-1][repeated]
-            room -= _rank(by_source)
+            room -= rank(by_source)
         plain, fresh = np.empty((2, end), dtype=np.bool_)
         fresh[order] = by_t > before
         plain[order] = (by_t >= before) & (room > 0)
-        late = t <= self._time(number - 1) + rules.lead_s
+        late = t <= self._end
         plain &= np.abs(t - arrival) <= rules.max_skew_s
         if late.any():
             # A late reading of a source that is not waited for may be the end of its silence. An old one of a
             # source without any other may show its silence.
-            silent = self._time(number) - np.minimum(t, arrival) > rules.silence_s
+            silent = self._next_t - np.minimum(t, arrival) > rules.silence_s
             plain &= ~(late & fresh & (silent | ~self._waiting[source]))
         if not plain.all():
             end = int(plain.argmin())
         # The tick comes with the reading of the last source that it waits for, once its time is reached.
-        reached = int(latest[:end].searchsorted(self._time(number)))
+        reached = int(latest[:end].searchsorted(self._next_t))
         if reached < end:
             last = self._last_waiting(source[:end], fresh[:end] & ~late[:end])
             end = min(end, max(last + 1, reached))
@@ -481,6 +352,61 @@ class Aligner:
         if chosen.size:
             self._place_run(readings, begin + chosen, late[chosen])
         return begin + end
+
+    def _run_end(self) -> float:
+        """Time from which a tick may come before a reading: the end of the grace, or of the backlog."""
+        rules = self.rules
+        return min(self._next_t + rules.grace_s, self._time(self._number() + rules.backlog))
+
+    def _scans_of(self, source: Ints) -> _Scans:
+        """Scans of readings; those of a concentrator repeat and are kept."""
+        key = source.tobytes()
+        found = self._scans.get(key)
+        if found is None:
+            if len(self._scans) >= SCANS_KEPT:
+                self._scans.clear()
+            found = self._scans[key] = _Scans(source)
+        return found
+
+    def _place_scan(self, readings: Readings, latest: Floats, begin: int, scans: _Scans) -> int:
+        """Place the scan from `begin` if it is a run of accepted readings; return its end, otherwise 0.
+
+        latest (n,): as for `_run`.
+        """
+        (end, at), rules = scans.at(begin, self._count.size), self.rules
+        size, last = end - begin, float(latest[end - 1])
+        if size < ALONE or last >= self._run_end() or self._most + 2 > HELD_PER_SOURCE:
+            return 0
+        arrival, values = readings.arrival[begin:end], readings.values[:, begin:end]
+        t = values[T]
+        if not t.min() > self._end or not np.abs(t - arrival).max() <= rules.max_skew_s:
+            return 0
+        if not all_of(t > self._last_t[at]):
+            return 0
+        awaited = int(np.count_nonzero(self._waiting[at]))
+        # The tick comes with the last source that it waits for.
+        if last >= self._next_t and size != awaited:
+            return 0
+        source = readings.source[begin:end]
+        self._clocks.note_all(source, t, arrival)
+        self._count_gaps(source, readings.seq[begin:end])
+        if self._most:
+            slot = self._count[source]
+            self._extend(int(slot.max()) + 1)
+            self._ahead[slot, :, source] = values.T
+        else:
+            self._most = 1
+            self._ahead[0, :, at] = values if isinstance(at, slice) else values.T
+        self._count[at] += 1
+        self._last_t[at] = t
+        self._last_heard[at] = arrival
+        if readings.v_phases is not None:
+            for k in np.flatnonzero(source == len(self.meters)):
+                self._keep_phases(float(t[k]), readings.phases_of(begin + int(k)))
+        self.counts[ReadingOutcome.ACCEPTED] += size
+        self._waiting[at] = False
+        self._waits -= awaited
+        return end
 
     def _last_waiting(self, source: Ints, reports: Bools) -> int:
         """Position of the reading after which no source is waited for; the size if some still are.
@@ -498,12 +424,11 @@ class Aligner:
     def _place_run(self, readings: Readings, at: Ints, late: Bools) -> None:
         """Place readings of a run, grouped by source; `late` are those that the last tick has missed."""
         source, arrival, values = readings.source[at], readings.arrival[at], readings.values[:, at]
-        slot = self._count[source] + _rank(source)
+        slot = self._count[source] + rank(source)
         self._clocks.note_all(source, values[T], arrival)
         self._count_gaps(source, readings.seq[at])
-        if (most := int(slot.max())) >= self._held.shape[1]:
-            self._grow(most + 1)
-        self._held[:, slot, source] = values
+        self._extend(int(slot.max()) + 1)
+        self._ahead[slot, :, source] = values.T
         # Of equal indices the last assignment counts.
         self._count[source] = slot + 1
         self._last_t[source] = values[T]
@@ -532,25 +457,26 @@ class Aligner:
         t, last_t = values[T], float(self._last_t[source])
         if now is not None and abs(t - now) > self.rules.max_skew_s:
             return ReadingOutcome.CLOCK_OFF
-        index, count = self._before(source, t), int(self._count[source])
-        if index < count and self._held[T, index, source] == t:
+        count = int(self._count[source])
+        later = self._ahead[:count, T, source]
+        index = int(later.searchsorted(t))
+        if t == self._served[T, source] or (index < count and later[index] == t):
             return ReadingOutcome.DUPLICATE
         if now is not None and self.rules.clock is Clock.WALL:
             self._clocks.note_all(np.array([source]), np.array([t]), np.array([now]))
         self._count_gap(source, seq, t)
-        late = self._next is not None and t <= self._time(self._next - 1) + self.rules.lead_s
+        late = t <= self._end
         if late and t <= last_t:
             return ReadingOutcome.LATE
-        if count >= HELD_PER_SOURCE:
+        if len(self._times(source)) >= HELD_PER_SOURCE:
             self._thin(source)
-            count = int(self._count[source])
-            if count >= HELD_PER_SOURCE:
+            if len(self._times(source)) >= HELD_PER_SOURCE:
                 return ReadingOutcome.OVERFLOW
-            index = self._before(source, t)
-        if count >= self._held.shape[1]:
-            self._grow(count + 1)
-        self._held[:, index + 1 : count + 1, source] = self._held[:, index:count, source]
-        self._held[:, index, source] = values
+            count = int(self._count[source])
+            index = int(self._ahead[:count, T, source].searchsorted(t))
+        self._extend(count + 1)
+        self._ahead[index + 1 : count + 1, :, source] = self._ahead[index:count, :, source]
+        self._ahead[index, :, source] = values
         self._count[source] = count + 1
         if source == len(self.meters):
             self._keep_phases(t, phases)
@@ -559,20 +485,18 @@ class Aligner:
         # A time stamp in the future does not prove that the meter still reports then.
         self._last_heard[source] = t if now is None or self.rules.clock is Clock.EVENTS else now
         if self._next is not None:
-            self._wait_for(source, self._next)
+            self._wait_for(source)
         if late:
             return ReadingOutcome.LATE
         return ReadingOutcome.ACCEPTED if in_order else ReadingOutcome.OUT_OF_ORDER
 
-    def _before(self, source: int, t: float) -> int:
-        """Number of held readings of a source before a time."""
-        return int(np.searchsorted(self._held[T, : self._count[source], source], t))
-
-    def _grow(self, least: int) -> None:
-        """Extend the table to at least `least` slots."""
-        slots = min(HELD_PER_SOURCE, max(least, 2 * self._held.shape[1]))
-        held, self._held = self._held, _empty(slots, self._count.size)
-        self._held[:, : held.shape[1]] = held
+    def _extend(self, most: int) -> None:
+        """Make room for `most` later readings of a source."""
+        self._most = max(self._most, most)
+        slots = self._ahead.shape[0]
+        if most > slots:
+            more = min(HELD_PER_SOURCE, max(most, 2 * slots)) - slots
+            self._ahead = np.concatenate([self._ahead, _empty(more, self._count.size)])
 
     def _thin(self, source: int) -> None:
         """Keep only the last reading between two ticks: no tick uses the others."""
@@ -583,17 +507,25 @@ class Aligner:
 
     def _keep(self, source: int, which: list[int]) -> None:
         """Keep only some held readings of a source, by position."""
-        kept = self._held[:, which, source]
-        self._held[:, :, source] = np.nan
-        self._held[T, :, source] = np.inf
-        self._held[:, : len(which), source] = kept
-        self._count[source] = len(which)
+        served = self._served[T, source] > -math.inf
+        held = self._ahead[: self._count[source], :, source]
+        held = np.concatenate([self._served[None, :, source], held] if served else [held])[which]
+        if served:  # The first one that is kept serves the same tick.
+            self._served[:, source], held = held[0], held[1:]
+        self._ahead[:, T, source] = np.inf
+        self._ahead[: len(held), :, source] = held
+        self._count[source] = len(held)
         self._drop_phases()
+
+    def _held(self) -> Ints:
+        """Number of held readings of each source, (p + 1,)."""
+        return np.asarray(self._count + (self._served[T] > -math.inf))
 
     def _times(self, source: int) -> list[float]:
         """Times of the held readings of a source, s."""
-        times: list[float] = self._held[T, : self._count[source], source].tolist()
-        return times
+        times: list[float] = self._ahead[: self._count[source], T, source].tolist()
+        served = float(self._served[T, source])
+        return times if served == -math.inf else [served, *times]
 
     def _count_gap(self, source: int, seq: int, t: float) -> None:
         # A decreasing number is a restart or a changed order, not a loss. The ring of the subscription drops
@@ -612,7 +544,7 @@ class Aligner:
         if not numbered.any():
             return
         source, seq = source[numbered], seq[numbered]
-        before = np.where(_rank(source) > 0, np.concatenate(([NO_SEQ], seq[:-1])), self._seq[source])
+        before = np.where(rank(source) > 0, np.concatenate(([NO_SEQ], seq[:-1])), self._seq[source])
         gap = seq - before - 1
         self.lost += int(gap[(before != NO_SEQ) & (gap > 0) & (gap <= GAP_MAX)].sum())
         self._seq[source] = seq
@@ -666,7 +598,7 @@ class Aligner:
             if len(fits) == len(times):
                 continue
             for k in sorted({*range(len(times))} - {*fits}):
-                t, v_volt, p_kw, q_kvar, t_power = self._held[:, k, source].tolist()
+                t, v_volt, p_kw, q_kvar, t_power = self._ahead[k, :, source].tolist()
                 phases = self._phases.get(t) if source == len(self.meters) else None
                 self._refused.append(
                     Reading("", self._name(source), t, v_volt, p_kw, q_kvar, None, phases, t_power)
@@ -690,9 +622,10 @@ class Aligner:
             # The clock was set back: without a restart there would be no tick until it reaches its previous
             # time.
             self.restarts += 1
-            self._held = _empty(SLOTS, self._count.size)
+            self._served[T] = -np.inf
+            self._ahead = _empty(SLOTS, self._count.size)
             self._phases.clear()
-            self._count[:] = 0
+            self._count[:], self._most = 0, 0
             for times in (self._last_t, self._last_heard, self._last_used):
                 times[:] = -math.inf
             self._clocks.forget()
@@ -702,25 +635,23 @@ class Aligner:
         self._latest = max(self._latest, wall)
         yield from self._emit_ticks(wall)
 
-    def _emit_ticks(self, wall: float) -> Iterator[Tick]:
-        now = self.now(wall)
+    def _emit_ticks(self, wall: float) -> list[Tick]:
+        now, ticks = self.now(wall), list[Tick]()
         if now is None:
-            return
+            return ticks
         if self._next is None:
             self._begin(now)
+        if now < self._next_t:
+            return ticks
         first = self._number()
         behind = math.floor(now / self.rules.tick_s) - first
         if behind > self.rules.backlog:
             self._skip(first, self._resume(first + behind))
             # A skipped tick was not formed and is not evidence of silence.
             self._resumed = self._time(self._number())
-        while True:
-            t = self._time(self._number())
-            if now < t or (self._waits and now < t + self.rules.grace_s):
-                return
-            tick = self._tick(t)
-            self._turn_to(self._number() + 1)
-            yield tick
+        while now >= self._next_t + (self.rules.grace_s if self._waits else 0.0):
+            ticks.append(self._tick())
+        return ticks
 
     def excuse(self) -> None:
         """Count no time until now as silence: the readings were discarded."""
@@ -737,10 +668,8 @@ class Aligner:
         if now is None or now == -math.inf:
             return
         yield from self.due(now)
-        while self._time(self._number()) <= now:
-            tick = self._tick(self._time(self._number()))
-            self._turn_to(self._number() + 1)
-            yield tick
+        while self._next_t <= now:
+            yield self._tick()
 
     def _resume(self, now: int) -> int:
         """Number of the first tick to form after a step of the time to tick number `now`."""
@@ -778,33 +707,37 @@ class Aligner:
         return self._next
 
     def _turn_to(self, number: int) -> None:
-        self._next = number
-        before = self._time(number - 1) + self.rules.lead_s
-        # The newest reading at or before the last tick may serve the next one; older ones never will.
-        done = np.maximum((self._held[T] <= before).sum(axis=0) - 1, 0)
-        if done.any():
-            self._drop(done)
-        reported = self._last_t > before
+        self._next, self._next_t = number, self._time(number)
+        self._end = self._time(number - 1) + self.rules.lead_s
+        self._serve(self._end)
         # Independent of usability: with long ticks the last source would otherwise be late at every tick, and
         # silent.
-        self._waiting = ~(reported | (self._silent_for(self._last_t, self._time(number)) > 0.0))
+        reported = self._last_t > self._end
+        self._waiting = ~(reported | (self._silent_for(self._last_t, self._next_t) > 0.0))
         self._waits = int(np.count_nonzero(self._waiting))
 
-    def _drop(self, done: Ints) -> None:
-        """Drop the oldest held readings of each source, by number."""
-        kept = self._count - done
-        slots = max(SLOTS, int(kept.max()))
-        old = self._held
-        held = _empty(slots, self._count.size)
-        if (done == done[0]).all():
-            left = min(slots, old.shape[1] - int(done[0]))
-            held[:, :left] = old[:, int(done[0]) : int(done[0]) + left]
+    def _serve(self, end: float) -> None:
+        """Keep the newest reading of each source until a time, s, and all later ones."""
+        if not self._most:
+            return
+        later = self._ahead[: self._most]
+        if self._most == 1:
+            newest = later[0]
+            done = newest[T] <= end
         else:
-            there = np.minimum(np.arange(slots)[:, None] + done, old.shape[1] - 1)
-            filled = np.arange(slots)[:, None] < kept
-            moved = np.take_along_axis(old, np.broadcast_to(there, (COLUMNS, *there.shape)), axis=1)
-            np.copyto(held, moved, where=filled)
-        self._held, self._count = held, kept
+            done = np.count_nonzero(later[:, T] <= end, axis=0)
+            newest = later[np.maximum(done, 1) - 1, :, self._each].T
+        np.copyto(self._served, newest, where=done > 0)
+        self._count = self._count - done
+        self._most = int(self._count.max())
+        if self._most:
+            there = np.minimum(np.arange(self._most)[:, None] + done, len(later) - 1)
+            left = later[there, :, self._each].transpose(0, 2, 1)
+            left[:, T][np.arange(self._most)[:, None] >= self._count] = np.inf
+            later[: self._most] = left
+        later[self._most :, T] = np.inf
+        if len(self._ahead) > max(SLOTS, 2 * self._most):
+            self._ahead = self._ahead[: max(SLOTS, self._most)].copy()
         self._drop_phases()
 
     def _drop_phases(self) -> None:
@@ -813,13 +746,13 @@ class Aligner:
             times = set(self._times(len(self.meters)))
             self._phases = {t: phases for t, phases in self._phases.items() if t in times}
 
-    def _wait_for(self, source: int, number: int) -> None:
-        """Wait for a source at a tick if it is not silent and has not reported for it."""
+    def _wait_for(self, source: int) -> None:
+        """Wait for a source at the next tick if it is not silent and has not reported for it."""
         last_t = self._last_t[source : source + 1]
-        wait = not last_t[0] > self._time(number - 1) + self.rules.lead_s
+        wait = not last_t[0] > self._end
         if wait:
             heard = self._last_heard[source : source + 1]
-            wait = not self._silent_for(last_t, self._time(number), heard)[0] > 0.0
+            wait = not self._silent_for(last_t, self._next_t, heard)[0] > 0.0
         self._waits += int(wait) - int(self._waiting[source])
         self._waiting[source] = wait
 
@@ -836,14 +769,17 @@ class Aligner:
             since[since == math.inf] = 0.0
         return np.where(since > silence_s, since, 0.0)
 
-    def _tick(self, t: float) -> Tick:
-        index = (self._held[T] <= t + self.rules.lead_s).sum(axis=0) - 1
-        values = self._held[:, np.maximum(index, 0), self._each]
-        usable = (index >= 0) & (t - values[T] < self.rules.max_age_s)
+    def _tick(self) -> Tick:
+        """Form the next tick."""
+        t = self._next_t
+        self._serve(t + self.rules.lead_s)
+        values = self._served.copy()
+        usable = t - values[T] < self.rules.max_age_s
         np.copyto(self._last_used, values[T], where=usable)
-        values[:, ~usable] = np.nan
+        if not all_of(usable):
+            values[:, ~usable] = np.nan
         seconds = self._silent_for(self._last_used, t)
-        silent = tuple((self._name(int(k)), float(seconds[k])) for k in np.flatnonzero(seconds))
+        silent = tuple((self._name(k), float(seconds[k])) for k in indices(seconds > 0.0).tolist())
         skipped, self._skipped = self._skipped, 0
         if self._number() % OFFSETS_TICKS == 0:
             found = self._clocks.measured(t)
@@ -852,11 +788,40 @@ class Aligner:
             self._offsets = offsets if any(offsets) else ()
         phases = self._phases.get(float(values[T, -1])) if self._phases else None
         known = self._clocks.known if self.rules.clock is Clock.WALL else None
+        self._turn_to(self._number() + 1)
         return Tick(t, values, silent, skipped, self._offsets, self._busbar_offset, phases, known)
 
 
 def _empty(slots: int, sources: int) -> Floats:
-    """Table of held readings without any, (5, slots, sources)."""
-    held = np.full((COLUMNS, slots, sources), np.nan)
-    held[T] = np.inf
-    return held
+    """Table of readings without any, (slots, 5, sources)."""
+    table = np.full((slots, COLUMNS, sources), np.nan)
+    table[:, T] = np.inf
+    return table
+
+
+class _Scans:
+    """Scans of readings: successive readings of different sources.
+
+    source (n,): sources of the readings.
+    """
+
+    def __init__(self, source: Ints) -> None:
+        self._source = source
+        order = source.argsort(kind="stable")
+        again = source[order[1:]] == source[order[:-1]]
+        # Position of the last reading of the same source.
+        self._before = np.full(source.size, -1)
+        self._before[order[1:][again]] = order[:-1][again]
+        self._found: dict[int, tuple[int, slice | Ints]] = {}
+
+    def at(self, begin: int, most: int) -> tuple[int, slice | Ints]:
+        """Return the end of the longest scan from a position, and its sources; `most` is their number."""
+        found = self._found.get(begin)
+        if found is None:
+            repeated = self._before[begin : begin + most] >= begin
+            end = begin + int(repeated.argmax()) if any_of(repeated) else begin + repeated.size
+            first, each = int(self._source[begin]), self._source[begin:end]
+            in_order = all_of(each == np.arange(first, first + each.size))
+            found = end, slice(first, first + each.size) if in_order else each
+            self._found[begin] = found
+        return found

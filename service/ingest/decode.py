@@ -6,23 +6,18 @@ all numbers. Only the others are parsed and judged one by one.
 
 The zenoh encoding gives the format: JSON (also without an encoding), and for concentrators the same fields as
 columns in CBOR (a map of arrays of equal length) or Arrow IPC (stream or file, uncompressed).
-
-Arrow is designed for trusted data: a small payload can expand to a huge table (compressed buffers, null or
-dictionary columns), and unchecked offsets point outside of the buffers. Only plain, uncompressed columns are
-read, after full validation.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import struct
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
-from typing import Any
+from typing import Any, TypeAlias
 
 import cbor2
 import msgspec
@@ -30,19 +25,18 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import structlog
-from pyarrow import ipc
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, all_of
 from service.access.signing import MeterKeys, Refusal
+from service.ingest.arrow import ArrowProblem, Column, column_of, layout_of, record_batches
 from service.ingest.queues import Sample
 from service.ingest.reading import (
     COLUMNS,
     HEAD_BYTES,
     NO_SEQ,
+    P_KW,
     PHASES,
     SEQ_MAX,
-    T_MAX,
-    T_MIN,
     VOLT_FACTOR,
     BadReading,
     BadReason,
@@ -60,6 +54,8 @@ from service.ingest.reading import (
 _log = structlog.get_logger("gridsec.runtime")
 ORDERS_KEPT = 32
 """Number of columns of meters with kept positions, for each feeder."""
+LAYOUTS_KEPT = 8
+"""Number of concentrators with a kept layout, for each feeder."""
 
 
 JSON_ENCODINGS = frozenset({"", "zenoh/bytes", "zenoh/string", "text/plain", "application/json", "text/json"})
@@ -93,8 +89,8 @@ class Wire:
     prefix: str = "gridsec"  # first chunks of every key, without a final slash
     max_bytes: int = 256 * 1024  # size of the largest accepted payload, bytes
     keys: MeterKeys | None = None  # keys of meters; None accepts readings without signature
-    # Feeder and source of the zenoh keys of single readings so far.
-    places: dict[str, tuple[str, int]] = field(default_factory=dict)
+    # Feeder and source of single JSON readings so far, by zenoh key and encoding.
+    places: dict[tuple[str, str], tuple[str, int]] = field(default_factory=dict)
 
     def decode(
         self,
@@ -141,29 +137,31 @@ class Wire:
         A defect of the decoder costs one payload only.
         """
         parts: dict[str, list[Readings]] = {}
-        singles: dict[str, _Singles] = {}
+        singles: dict[str, list[_Single]] = {}
         bad: list[tuple[BadReading, Sample]] = []
 
         def flush(feeder: str) -> None:
-            readings, refused = self._finish(singles.pop(feeder))
+            readings, refused = self._finish(feeder, singles.pop(feeder))
             bad.extend(refused)
             parts.setdefault(feeder, []).extend(readings)
 
+        places = self.places
         for sample in samples:
-            place = self._place_of(sample)
+            key, payload, encoding, _, size, _ = sample
+            place = places.get((key, encoding)) if size <= self.max_bytes else None
+            if place is None:
+                place = self._place_of(sample)
             if place is not None:
                 try:
-                    raw = _decode_one(sample.payload)
+                    raw = _decode_one(payload)
                 except (msgspec.MsgspecError, RecursionError):
                     pass
                 else:
                     feeder, source = place
                     rows = singles.get(feeder)
                     if rows is None:
-                        rows = singles[feeder] = _Singles(feeder)
-                    rows.raws.append(raw)
-                    rows.sources.append(source)
-                    rows.samples.append(sample)
+                        rows = singles[feeder] = []
+                    rows.append((source, raw, sample))
                     continue
             decoded = self._decoded(sample)
             bad.extend((one, sample) for one in decoded.bad)
@@ -180,25 +178,27 @@ class Wire:
         """Feeder and source of a payload that may be a valid single JSON reading; None for all others."""
         if self.keys is not None or sample.encoding not in JSON_ENCODINGS or sample.size > self.max_bytes:
             return None
-        place = self.places.get(sample.key)
-        if place is None:
-            source = source_of(sample.key, self.prefix, self.known)
-            if isinstance(source, BadReading) or source.concentrator is not None:
-                return None
-            place = self.places[sample.key] = (source.feeder, self.known[source.feeder].index[source.meter])
+        source = source_of(sample.key, self.prefix, self.known)
+        if isinstance(source, BadReading) or source.concentrator is not None:
+            return None
+        place = source.feeder, self.known[source.feeder].index[source.meter]
+        self.places[sample.key, sample.encoding] = place
         return place
 
-    def _finish(self, rows: _Singles) -> tuple[list[Readings], list[tuple[BadReading, Sample]]]:
+    def _finish(
+        self, feeder: str, rows: Sequence[_Single]
+    ) -> tuple[list[Readings], list[tuple[BadReading, Sample]]]:
         """Validate single readings of a feeder together; return the usable and the bad ones."""
-        arrival = np.array([sample.arrival for sample in rows.samples])
-        readings, good = _of_raws(self.known[rows.feeder], rows.feeder, rows.sources, rows.raws, arrival)
+        sources, raws, samples = zip(*rows, strict=True)
+        arrival = np.array([sample.arrival for sample in samples])
+        readings, good = _of_raws(self.known[feeder], feeder, sources, raws, arrival)
         if good.all():
             return [readings], []
         kept: list[Readings] = []
         bad: list[tuple[BadReading, Sample]] = []
         for k in np.flatnonzero(~good).tolist():
-            decoded = self._decoded(rows.samples[k])
-            bad.extend((one, rows.samples[k]) for one in decoded.bad)
+            decoded = self._decoded(samples[k])
+            bad.extend((one, samples[k]) for one in decoded.bad)
             good[k] = decoded.readings is not None
         if good.any():
             kept.append(_some(readings, good))
@@ -230,14 +230,8 @@ class Gathered:
     bad: list[tuple[BadReading, Sample]]  # bad readings, with their payloads
 
 
-@dataclass(frozen=True, slots=True)
-class _Singles:
-    """Well-typed single readings of one feeder."""
-
-    feeder: str
-    raws: list[WireReading] = field(default_factory=list)
-    sources: list[int] = field(default_factory=list)
-    samples: list[Sample] = field(default_factory=list)
+_Single: TypeAlias = tuple[int, WireReading, Sample]
+"""Source, contents and payload of a well-typed single reading."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,55 +292,70 @@ def _some(readings: Readings, which: Bools) -> Readings:
     )
 
 
-def plausible(known: Known, source: Ints, values: Floats, seq: Ints) -> Bools:
-    """True for readings with plausible numbers, (n,); NaN stands for an absent power, or time of powers.
+def plausible(known: Known, source: Ints, values: Floats, given: Bools) -> Bools:
+    """True for readings with plausible numbers, (n,).
 
-    Arguments are columns as in `Readings`; `source` may be -1, which is not plausible.
+    Arguments are columns as in `Readings`; `source` may be -1, which is not plausible. `given` (5, n) is
+    False for absent numbers, which are NaN.
     """
-    t, v_volt, p_kw, q_kvar, t_power = values
-    limit = known.power_max_kw
-    good = (source >= 0) & (t >= T_MIN) & (t <= T_MAX) & (v_volt > 0.0) & (v_volt <= known.volt_max[source])
-    good &= ((np.abs(p_kw) <= limit) | np.isnan(p_kw)) & ((np.abs(q_kvar) <= limit) | np.isnan(q_kvar))
-    good &= ((t_power >= T_MIN) & (t_power <= T_MAX)) | np.isnan(t_power)
-    return np.asarray(good & (seq >= NO_SEQ))
+    inside = (values >= known.lowest.take(source, axis=1)) & (values <= known.highest.take(source, axis=1))
+    inside[P_KW:] |= ~given[P_KW:]
+    return np.logical_and.reduce(inside, axis=0)
 
 
 def _of_raws(
     known: Known, feeder: str, sources: Sequence[int], raws: Sequence[WireReading], arrival: Floats
 ) -> tuple[Readings, Bools]:
     """Return well-typed readings as columns, and which of them are plausible, (n,)."""
-    values = np.array(
-        [
-            [raw.t for raw in raws],
-            [raw.v_volt for raw in raws],
-            [raw.p_kw for raw in raws],
-            [raw.q_kvar for raw in raws],
-            [raw.t_power for raw in raws],
-        ],
-        dtype=np.float64,
+    columns = (
+        [raw.t for raw in raws],
+        [raw.v_volt for raw in raws],
+        [raw.p_kw for raw in raws],
+        [raw.q_kvar for raw in raws],
+        [raw.t_power for raw in raws],
     )
     source = np.array(sources, dtype=np.intp)
-    seq, wrong = _sequence([raw.seq for raw in raws])
-    good = plausible(known, source, values, seq) & ~wrong
-    phases = None
-    for k, v_phases in enumerate([raw.v_phases for raw in raws]):
-        if v_phases is None:
-            continue
-        good[k] &= len(v_phases) == PHASES
-        if good[k] and any(v is not None for v in v_phases):
-            phases = np.full((PHASES, source.size), np.nan) if phases is None else phases
-            phases[:, k] = np.array(v_phases, dtype=np.float64)
-    if phases is not None:
-        # An outage of a phase gives the voltage 0.
-        good &= ~((phases < 0.0) | (phases > VOLT_FACTOR * known.nominal_volt)).any(axis=0)
+    values, given = _numbers_of(columns)
+    seq, fits = _sequence([raw.seq for raw in raws])
+    good = plausible(known, source, values, given) & fits
+    phases = _phases_of([raw.v_phases for raw in raws], known, good)
     return Readings(feeder, source, values, seq, arrival, phases), good
 
 
-def _sequence(numbers: Sequence[int | None]) -> tuple[Ints, Bools]:
-    """Return sequence numbers as a column, and which of them are outside of the permitted range, (n,)."""
-    wrong = np.array([one is not None and not 0 <= one <= SEQ_MAX for one in numbers], dtype=np.bool_)
+def _numbers_of(columns: Sequence[Sequence[float | None] | None]) -> tuple[Floats, Bools]:
+    """Return columns of numbers as an array, and which of them are given, (5, n); a column may be absent."""
+    size = len(next(column for column in columns if column is not None))
+    values, given = np.full((COLUMNS, size), np.nan), np.zeros((COLUMNS, size), dtype=np.bool_)
+    for row, column in enumerate(columns):
+        absent = size if column is None else column.count(None)
+        if column is not None and absent < size:
+            values[row] = np.array(column, dtype=np.float64)
+            given[row] = [one is not None for one in column] if absent else True
+    return values, given
+
+
+def _phases_of(found: Sequence[list[float | None] | None], known: Known, good: Bools) -> Floats | None:
+    """Voltages of the phases of readings, (3, n); None without any. `good` becomes False if implausible."""
+    if found.count(None) == len(found):
+        return None
+    phases = np.full((PHASES, len(found)), np.nan)
+    for k, v_phases in enumerate(found):
+        if v_phases is not None:
+            good[k] &= len(v_phases) == PHASES
+            if good[k]:
+                phases[:, k] = np.array(v_phases, dtype=np.float64)
+    # An outage of a phase gives the voltage 0.
+    good &= ~((phases < 0.0) | (phases > VOLT_FACTOR * known.nominal_volt)).any(axis=0)
+    return None if np.isnan(phases).all() else phases
+
+
+def _sequence(numbers: Sequence[int | None]) -> tuple[Ints, Bools | bool]:
+    """Return sequence numbers as a column, and which of them are in the permitted range, (n,) or for all."""
+    if numbers.count(None) == len(numbers):
+        return np.full(len(numbers), NO_SEQ, dtype=np.int64), True
+    fits = np.array([one is None or 0 <= one <= SEQ_MAX for one in numbers], dtype=np.bool_)
     column = [NO_SEQ if one is None or not 0 <= one <= SEQ_MAX else one for one in numbers]
-    return np.array(column, dtype=np.int64), wrong
+    return np.array(column, dtype=np.int64), fits
 
 
 def _verified(
@@ -542,159 +551,31 @@ def _of_lists(columns: Mapping[str, list[Any]], of: Payload) -> DecodedPayload:
         return {name: column[k] for name, column in columns.items()}
 
     size = len(columns["t"])
-    numbers = [columns.get(name) or [None] * size for name in _NUMBERS]
+    numbers = [columns.get(name) for name in _NUMBERS]
     names, counts = columns["meter"], columns.get("seq") or [None] * size
-    typed = all(_NUMERIC.issuperset(map(type, column)) for column in numbers)
+    typed = all(_NUMERIC.issuperset(map(type, column)) for column in numbers if column is not None)
     typed = typed and _NAMING.issuperset(map(type, names)) and _COUNTING.issuperset(map(type, counts))
     if not typed or not size:
         return _batch([row(k) for k in range(size)], of)
     try:
-        values = np.array(numbers, dtype=np.float64)
+        values, given = _numbers_of(numbers)
     except OverflowError:  # an integer of hundreds of digits
         return _batch([row(k) for k in range(size)], of)
     source = np.array([of.known.index.get(name, -1) for name in names], dtype=np.intp)
-    seq, wrong = _sequence(counts)
-    good = plausible(of.known, source, values, seq) & ~wrong
-    # NaN is absent only as a null.
-    for column, found in zip(numbers, np.isnan(values), strict=True):
-        for k in np.flatnonzero(found).tolist():
-            good[k] &= column[k] is None
+    seq, fits = _sequence(counts)
+    good = plausible(of.known, source, values, given) & fits
     return _sorted_out(of.columns(source, values, seq), good, row, of)
 
 
-_RECORD_BATCH_COMPRESSION_SLOT = 3
-_MESSAGE_HEADER_SLOT = 2
-_UNREADABLE = (
-    pa.ArrowException,
-    OSError,
-    EOFError,
-    ValueError,
-    TypeError,
-    LookupError,
-    OverflowError,
-    MemoryError,
-    struct.error,
-)
-
-
-class ArrowProblem(ValueError):
-    """A payload cannot be read.
-
-    problems: one sentence for each problem.
-    well_formed: True for valid Arrow IPC.
-    """
-
-    def __init__(self, problems: Iterable[str], *, well_formed: bool) -> None:
-        self.problems = tuple(problems)
-        self.well_formed = well_formed
-        super().__init__("; ".join(self.problems))
-
-
-def record_batches(
-    payload: bytes, is_file: bool, names: tuple[str, ...]
-) -> tuple[list[pa.RecordBatch], tuple[str, ...]]:
-    """Return the record batches of an Arrow IPC stream or file, and the names that its columns include.
-
-    With `is_file` the payload has the file format (with a footer). Raises ArrowProblem if the payload is not
-    Arrow IPC, is compressed, or a requested column is not a plain column of strings (`meter`), integers
-    (`seq`) or numbers (all others).
-    """
-    try:
-        reader = _open(payload, is_file)
-        _check_columns(reader.schema, names)
-        batches = []
-        for batch in _batches(reader, limit=len(payload)):
-            batch.validate(full=True)
-            batches.append(batch)
-    except ArrowProblem:
-        raise
-    except _UNREADABLE as error:
-        detail = str(error).partition("\n")[0] or type(error).__name__
-        raise ArrowProblem([f"not Arrow IPC: {detail}"], well_formed=False) from error
-    return batches, tuple(name for name in names if name in reader.schema.names)
-
-
-def _open(payload: bytes, is_file: bool) -> Any:
-    if is_file:
-        # The file format wraps the messages of a stream between two magic words: the check for compression
-        # works for both. Reading from front to back does not need the footer.
-        if payload[:6] != b"ARROW1" or payload[-6:] != b"ARROW1":
-            raise pa.ArrowInvalid("not an Arrow file")
-        payload = payload[8:]
-    _refuse_compression(payload)
-    return ipc.open_stream(pa.py_buffer(payload))
-
-
-def _refuse_compression(payload: bytes) -> None:
-    source = pa.BufferReader(payload)
-    while True:
-        try:
-            message = ipc.read_message(source)
-        except EOFError:
-            return
-        if message.type == "record batch" and _is_compressed(message.metadata.to_pybytes()):
-            raise ArrowProblem(
-                ["compressed Arrow IPC is not supported; write it uncompressed"], well_formed=True
-            )
-        if message.type == "dictionary":
-            raise ArrowProblem(
-                ["dictionary columns are not supported; write plain strings"], well_formed=True
-            )
-
-
-def _is_compressed(metadata: bytes) -> bool:
-    """True if a record batch's flatbuffer header has its `compression` field set."""
-    message = struct.unpack_from("<I", metadata, 0)[0]
-    header = _slot(metadata, message, _MESSAGE_HEADER_SLOT)
-    if header == 0:
-        return False
-    batch = header + struct.unpack_from("<I", metadata, header)[0]
-    return _slot(metadata, batch, _RECORD_BATCH_COMPRESSION_SLOT) != 0
-
-
-def _slot(data: bytes, table: int, index: int) -> int:
-    """Return the position of field `index` of a flatbuffer table, 0 if absent."""
-    vtable = table - struct.unpack_from("<i", data, table)[0]
-    size = struct.unpack_from("<H", data, vtable)[0]
-    entry = 4 + 2 * index
-    if entry >= size:
-        return 0
-    offset = struct.unpack_from("<H", data, vtable + entry)[0]
-    return table + offset if offset else 0
-
-
-def _check_columns(schema: pa.Schema, names: tuple[str, ...]) -> None:
-    problems = []
-    for name in names:
-        count = schema.names.count(name)
-        if count > 1:
-            problems.append(f"column `{name}` appears {count} times")
-        if count != 1:
-            continue
-        kind = schema.field(name).type
-        if name == "meter":
-            good = pa.types.is_string(kind) or pa.types.is_large_string(kind)
-        elif name == "seq":
-            good = pa.types.is_integer(kind)
-        else:
-            good = pa.types.is_integer(kind) or pa.types.is_floating(kind)
-        if not good:
-            problems.append(f"column `{name}` has type {kind}")
-    if problems:
-        raise ArrowProblem(problems, well_formed=True)
-
-
-def _batches(reader: Any, limit: int) -> Iterable[Any]:
-    rows = 0
-    for batch in reader:
-        rows += batch.num_rows
-        # A row takes at least one byte, otherwise its length is false (a column without buffers).
-        if rows > limit:
-            raise ArrowProblem([f"more than {limit} rows in {limit} bytes"], well_formed=True)
-        yield batch
-
-
 def _arrow(payload: bytes, of: Payload, *, is_file: bool) -> DecodedPayload:
+    layouts, key = of.known.layouts, (of.key, is_file)
+    if key in layouts:
+        layout, source = layouts[key]
+        columns = layout.columns(payload)
+        if columns is not None:
+            readings, good = _of_columns(columns, source, of)
+            if all_of(good):
+                return DecodedPayload(readings)
     try:
         batches, present = record_batches(payload, is_file, _FIELDS)
     except ArrowProblem as error:
@@ -705,6 +586,12 @@ def _arrow(payload: bytes, of: Payload, *, is_file: bool) -> DecodedPayload:
     parts = [_of_batch(batch, present, of) for batch in batches if batch.num_rows]
     if not parts:
         return _batch([], of)
+    if len(batches) == 1:
+        found = layout_of(payload, batches[0], [name for name in present if name != "meter"])
+        if found is not None:
+            if len(layouts) >= LAYOUTS_KEPT:
+                layouts.clear()
+            layouts[key] = found, parts[0][0].source
     begins = np.cumsum([0, *(len(readings) for readings, _ in parts)])
 
     def row(k: int) -> dict[str, Any]:
@@ -735,28 +622,29 @@ def _sources_of(known: Known, names: pa.Array) -> Ints:
 
 def _of_batch(batch: pa.RecordBatch, present: Collection[str], of: Payload) -> tuple[Readings, Bools]:
     """Return the readings of a record batch, and which of them are plausible, (n,)."""
-    size = batch.num_rows
-    values = np.full((COLUMNS, size), np.nan)
-    good = np.ones(size, dtype=np.bool_)
-    for number, name in enumerate(_NUMBERS):
-        if name not in present:
+    columns = {name: column_of(batch, name) for name in present if name != "meter"}
+    return _of_columns(columns, _sources_of(of.known, batch.column("meter")), of)
+
+
+def _of_columns(columns: Mapping[str, Column], source: Ints, of: Payload) -> tuple[Readings, Bools]:
+    """Return the readings of columns, and which of them are plausible, (n,)."""
+    size = source.size
+    values, given = np.full((COLUMNS, size), np.nan), np.zeros((COLUMNS, size), dtype=np.bool_)
+    for row, name in enumerate(_NUMBERS):
+        column = columns.get(name)
+        if column is None:
             continue
-        column = batch.column(name)
-        values[number] = column.to_numpy(zero_copy_only=False)
-        absent = np.isnan(values[number])
-        if absent.any():
-            # NaN is absent only as a null.
-            good &= ~(absent & column.is_valid().to_numpy(zero_copy_only=False))
+        values[row] = column.values
+        given[row] = True if column.valid is None else column.valid
+        if column.valid is not None:
+            values[row, ~column.valid] = np.nan
+    good = plausible(of.known, source, values, given)
     seq = np.full(size, NO_SEQ, dtype=np.int64)
-    if "seq" in present:
-        column = batch.column("seq")
-        valid = column.is_valid().to_numpy(zero_copy_only=False)
-        counts = pc.fill_null(column, 0).to_numpy(zero_copy_only=False)
-        fits = (counts >= 0) & (counts <= SEQ_MAX)
-        good &= fits
-        seq[valid & fits] = counts[valid & fits]
-    source = _sources_of(of.known, batch.column("meter"))
-    good &= plausible(of.known, source, values, seq)
+    if (counts := columns.get("seq")) is not None:
+        valid = True if counts.valid is None else counts.valid
+        fits = (counts.values >= 0) & (counts.values <= SEQ_MAX)
+        good &= fits | ~np.asarray(valid)
+        np.copyto(seq, counts.values, where=fits & valid, casting="unsafe")
     return of.columns(source, values, seq), good
 
 

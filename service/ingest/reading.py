@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow as pa
 
 from gridsec.arrays import Floats, Ints
+from service.ingest.arrow import Layout
 
 T_MIN, T_MAX = 1e8, 1e10
 """Range of Unix times, s (1973 to 2286); values outside are milliseconds, counters or uptimes."""
@@ -134,17 +135,29 @@ class Known:
     own_volt: Mapping[str, float] = field(default_factory=dict)
     order: tuple[str, ...] = field(init=False)  # the meters
     index: Mapping[str | None, int] = field(init=False)  # position of each meter; the busbar meter is last
-    volt_max: Floats = field(init=False, compare=False)  # largest plausible voltage of each source, V
+    # (5, p + 2): smallest and largest plausible numbers of each source as in `Readings.values`; the last
+    # column stands for unknown meters, without plausible numbers.
+    lowest: Floats = field(init=False, compare=False)
+    highest: Floats = field(init=False, compare=False)
     ids: pa.Array = field(init=False, compare=False)  # the meters as a column
     # Positions of the meters of columns, by contents.
     orders: dict[tuple[Any, ...], Ints] = field(init=False, compare=False, default_factory=dict)
+    # Layouts of the newest payloads in Arrow and their meters, by zenoh key and file format.
+    layouts: dict[tuple[str, bool], tuple[Layout, Ints]] = field(
+        init=False, compare=False, default_factory=dict
+    )
 
     def __post_init__(self) -> None:
         order = tuple(self.meters)
         object.__setattr__(self, "order", order)
         object.__setattr__(self, "index", {source: k for k, source in enumerate((*order, None))})
-        highest = np.array([VOLT_FACTOR * self.volt(source) for source in (*order, None)])
-        object.__setattr__(self, "volt_max", highest)
+        lowest, highest = np.empty((2, COLUMNS, len(order) + 2))
+        lowest[[T, T_POWER]], highest[[T, T_POWER]] = T_MIN, T_MAX
+        lowest[V_VOLT] = np.nextafter(0.0, 1.0)
+        highest[V_VOLT] = [*(VOLT_FACTOR * self.volt(source) for source in (*order, None)), -math.inf]
+        lowest[P_KW:T_POWER], highest[P_KW:T_POWER] = -self.power_max_kw, self.power_max_kw
+        object.__setattr__(self, "lowest", lowest)
+        object.__setattr__(self, "highest", highest)
         object.__setattr__(self, "ids", pa.array(order, pa.string()))
 
     def volt(self, meter: object) -> float:

@@ -11,13 +11,13 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Final, Literal, TypeAlias
+from typing import Annotated, Any, Final, Literal, Protocol, TypeAlias
 
 import numpy as np
 from pydantic import Field, TypeAdapter
 
 from feeders.model.site import Site, Snapshot, volts
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, all_of, any_of
 from gridsec.estimators.sequential import LearningReason, LearningState
 from gridsec.grid import Feeder
 from gridsec.interface import Cause, Decision, Estimate, Verdict
@@ -31,15 +31,15 @@ Phase: TypeAlias = Literal["a", "b", "c"]
 
 def snapshot(site: Site, tick: Tick) -> Snapshot:
     """Return a tick's readings in the form of `feeders.model.site.to_frame`."""
-    v_volt, p_kw, q_kvar = tick.values[[V_VOLT, P_KW, Q_KVAR], :-1]
-    age = tick.values[T, :-1] - tick.values[T_POWER, :-1]
+    values = tick.values[:, :-1]
+    age = values[T] - values[T_POWER]
     return Snapshot(
         t=tick.t,
-        v_volt=v_volt,
-        p_kw=p_kw,
-        q_kvar=q_kvar,
+        v_volt=values[V_VOLT],
+        p_kw=values[P_KW],
+        q_kvar=values[Q_KVAR],
         v0_volt=busbar_volt(site, tick),
-        p_age_s=None if np.isnan(age).all() else age,
+        p_age_s=None if all_of(np.isnan(age)) else age,
         clock_offset_s=np.array(tick.clock_offset, dtype=np.float64) if any(tick.clock_offset) else None,
         busbar_offset_s=math.nan if tick.busbar_offset is None else tick.busbar_offset,
     )
@@ -84,15 +84,14 @@ def grounds(
     site: Site, tick: Tick, estimate: Estimate | None = None, verdict: Verdict | None = None
 ) -> ReferenceVoltages:
     """Return the readings that the values of a tick use. Without a monitor each reading counts."""
-    used = tick.seen
-    busbar = np.isfinite(np.broadcast_to(busbar_volt(site, tick), len(busbar_phases(site))))
+    used, busbar = tick.seen, np.isfinite(_reported(site, tick))
     if estimate is not None:
         used &= estimate.trusted
     if verdict is not None:
         busbar = busbar & (verdict.cause is not Cause.NO_BUSBAR)
         busbar = busbar & ~verdict.busbar if verdict.busbar.size else busbar
     if site.feeder.busbar_phases == 1:
-        return ReferenceVoltages(np.array([used.any()]), busbar)
+        return ReferenceVoltages(np.array([any_of(used)]), busbar)
     of_meters = site.feeder.busbar_incidence()[site.meters[used]].any(axis=0)
     return ReferenceVoltages(np.asarray(of_meters, dtype=np.bool_), busbar)
 
@@ -263,7 +262,8 @@ def _furthest(which: Bools, off: Floats) -> int:
 
 def _reported(site: Site, tick: Tick) -> Floats:
     """Voltages reported by the busbar meter, V, NaN without a reading, (b,)."""
-    return np.broadcast_to(busbar_volt(site, tick), len(busbar_phases(site)))
+    found = busbar_volt(site, tick)
+    return found if isinstance(found, np.ndarray) else np.full(site.feeder.busbar_phases, found)
 
 
 def _attack_volts(site: Site, reported: Floats, verdict: Verdict) -> Floats:
@@ -574,6 +574,86 @@ class FeederReport(UtcTwins):
         """Meters that the verdict names as manipulated, the busbar meter as `BUSBAR`."""
         named = tuple(meter.meter for meter in self.meters if meter.suspect)
         return (*named, BUSBAR) if self.busbar.suspect else named
+
+    @property
+    def row(self) -> HistoryRow:
+        """Part of the meters that the history keeps."""
+        values = [[getattr(meter, name) for meter in self.meters] for name in HISTORY_COLUMNS]
+        flags = [[getattr(meter, name) for meter in self.meters] for name in HISTORY_FLAGS]
+        return history_row(
+            self.busbar,
+            tuple(meter.meter for meter in self.meters),
+            np.array(values, dtype=np.float64),
+            np.array(flags, dtype=np.bool_),
+        )
+
+
+HISTORY_COLUMNS: Final = ("v_volt_reported", "v_volt_estimated", "score", "threshold", "v_volt_std")
+"""Numbers of a meter that the history keeps."""
+HISTORY_FLAGS: Final = ("seen", "suspect", "model_only")
+"""Flags of a meter that the history keeps, in the order of their bits."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HistoryRow:
+    """Part of the meters at one tick that the history keeps. k meters, the busbar meter as `BUSBAR`, last."""
+
+    meters: tuple[str, ...]  # (k,) ids
+    values: Floats  # (5, k) `HISTORY_COLUMNS`; NaN for null
+    flags: Bools  # (3, k) `HISTORY_FLAGS`
+
+
+def history_row(
+    busbar: BusbarMeterState, meters: tuple[str, ...], values: Floats, flags: Bools
+) -> HistoryRow:
+    """Return the row of meters and the busbar meter, which has no score; arguments as in `HistoryRow`."""
+    own = [getattr(busbar, name, None) for name in HISTORY_COLUMNS]
+    told = [getattr(busbar, name) for name in HISTORY_FLAGS]
+    return HistoryRow(
+        (*meters, BUSBAR),
+        np.column_stack([np.where(np.isfinite(values), values, np.nan), np.array(own, dtype=np.float64)]),
+        np.column_stack([flags, told]),
+    )
+
+
+class Kept(Protocol):
+    """Tick that the history may keep: a report, or the part of it that the history keeps."""
+
+    @property
+    def feeder(self) -> str:
+        """Name of the feeder."""
+
+    @property
+    def t(self) -> float:
+        """Unix time, s."""
+
+    @property
+    def verdict(self) -> Decision:
+        """Verdict."""
+
+    @property
+    def cause(self) -> Cause:
+        """Cause of the verdict."""
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        """Meters that the verdict names as manipulated."""
+
+    @property
+    def row(self) -> HistoryRow:
+        """Part of the meters."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeptTick:
+    """Part of a report that the history keeps, as `Kept`."""
+
+    feeder: str
+    t: float
+    verdict: Decision
+    cause: Cause
+    suspects: tuple[str, ...]
+    row: HistoryRow
 
 
 _REPORT = TypeAdapter(FeederReport)

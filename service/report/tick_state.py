@@ -13,14 +13,16 @@ from typing import Any
 import numpy as np
 
 from feeders.model.site import Site, volts
-from gridsec.arrays import Bools, Floats
+from gridsec.arrays import Bools, Floats, any_of
 from gridsec.interface import Cause, Decision, Estimate, Verdict
 from service.ingest.align import Tick
+from service.ingest.reading import V_VOLT
 from service.report.data_errors import DataErrorReport
 from service.report.report import (
     BUSBAR,
     DisplayedVerdict,
     FeederReport,
+    KeptTick,
     LearningReport,
     ReferenceVoltages,
     Silence,
@@ -30,6 +32,7 @@ from service.report.report import (
     explanations,
     finite,
     grounds,
+    history_row,
     in_words,
     inverter_states,
     meter_states,
@@ -103,7 +106,7 @@ class TickState:
     @property
     def model_only(self) -> bool:
         """True if no value uses a voltage reading of this tick."""
-        return not self.grounds.measured.any()
+        return not any_of(self.grounds.measured)
 
     @cached_property
     def summary(self) -> Mapping[str, Any]:
@@ -175,12 +178,24 @@ class TickState:
         )
         return with_data_error(report, self.data_error)
 
-    def kept(self) -> FeederReport:
+    def kept(self) -> KeptTick:
         """Return the part of the report that the history keeps: the meters and the busbar meter."""
-        return self._part(None)
+        site, judgement = self.site, self.judgement
+        at = site.meters
+        v, std = (values[at] for values in self._volts)
+        unknown = np.full(at.size, np.nan)
+        score, threshold = (unknown, unknown) if judgement is None else (judgement.score, judgement.threshold)
+        suspects = np.zeros(at.size, dtype=np.bool_) if judgement is None else judgement.suspects
+        row = history_row(
+            busbar_report(site, self.tick, self.estimate, judgement),
+            site.meter_ids,
+            np.array([self.tick.values[V_VOLT, :-1], v, score, threshold, std]),
+            np.array([self.tick.seen, suspects, self.grounds.model_only(site)[at]]),
+        )
+        return KeptTick(self.feeder, self.t, self.verdict, self.cause, self.suspects, row)
 
-    def _part(self, which: Bools | None) -> FeederReport:
-        """Report of the feeder with its busbar meter and some meters, (p,), or all."""
+    def _part(self, which: Bools) -> FeederReport:
+        """Report of the feeder with its busbar meter and some meters, (p,)."""
         site, tick = self.site, self.tick
         limits, nominal = site.tables.meta.limits, site.tables.meta.voltage_volt
         return FeederReport(
@@ -212,7 +227,13 @@ class TickState:
             return in_words(self.reason, self.tick)
         return in_words(reason_of(self.site, self.tick, self.max_attacked, self.judgement), self.tick)
 
-    @cached_property
+    def completed(self, **fields: Any) -> TickState:
+        """Return the result with other values of fields that its readings do not depend on."""
+        after = replace(self, **fields)
+        vars(after)["grounds"] = self.grounds
+        return after
+
+    @property
     def _volts(self) -> tuple[Floats, Floats]:
         """Voltage of every customer and its standard deviation, V, (N,)."""
         if self.estimate is None:
@@ -232,9 +253,10 @@ class TickState:
             which |= np.array([offset is not None for offset in self.tick.clock_offset])
         if judgement is None:
             return which
-        v, limits, nominal = self._volts[0][site.meters], site.tables.meta.limits, site.customer_nominal
-        low, high = limits.v_min_pu * nominal[site.meters], limits.v_max_pu * nominal[site.meters]
-        which |= judgement.suspects | (v < low) | (v > high)
+        which |= judgement.suspects
+        if self.estimate is not None:
+            v, (low, high) = volts(site.meter_volt, self.estimate.v2[site.meters]), site.meter_limits
+            which |= (v < low) | (v > high)
         if judgement.decision is Decision.UNDECIDED:
             which |= ~self.tick.seen
         return which

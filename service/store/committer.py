@@ -33,7 +33,7 @@ from service.alarms.state_machine import Alarm, AlarmTransition, Change, carried
 from service.alarms.state_machine import to_json as alarm_json
 from service.ingest.queues import BusCounts, StoredEvent, Value
 from service.metrics import Metrics
-from service.report.report import FeederReport
+from service.report.report import Kept
 from service.store import AlarmEvent, OutcomeUnknown, Rejected, Store, StoreUnavailable
 from service.store.schema import CommissioningEvent, LeaseLost
 from service.store.state_codec import SnapshotKind, StateSnapshot
@@ -52,7 +52,7 @@ class Batch:
     """Contents of one transaction."""
 
     transitions: tuple[AlarmTransition, ...] = ()
-    reports: tuple[FeederReport, ...] = ()
+    reports: tuple[Kept, ...] = ()
     rejected: tuple[Rejected, ...] = ()
     kept: tuple[StateSnapshot, ...] = ()
     happened: tuple[CommissioningEvent, ...] = ()
@@ -73,7 +73,7 @@ class WriteQueue:
         self.given_up = 0
         self._forgotten = forgotten
         self._transitions: list[AlarmTransition] = []
-        self._reports: deque[FeederReport] = deque()
+        self._reports: deque[Kept] = deque()
         self._rejected: deque[Rejected] = deque()
         self._kept: dict[tuple[str, SnapshotKind], StateSnapshot] = {}
         self._happened: deque[CommissioningEvent] = deque()
@@ -91,7 +91,7 @@ class WriteQueue:
         self,
         *,
         transitions: Iterable[AlarmTransition] = (),
-        reports: Iterable[FeederReport] = (),
+        reports: Iterable[Kept] = (),
         rejected: Iterable[Rejected] = (),
         kept: Iterable[StateSnapshot] = (),
         happened: Iterable[CommissioningEvent] = (),
@@ -326,7 +326,7 @@ class Committer:
         store: Store,
         metrics: Metrics,
         stored: Callable[[], None],
-        kept: Callable[[tuple[FeederReport, ...]], None],
+        kept: Callable[[tuple[Kept, ...]], None],
         apart: Executor = inline,
         *,
         wall: Callable[[], float] = time.time,

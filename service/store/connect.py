@@ -267,6 +267,7 @@ class Connections:
         self._session: WriterSession | None = None
         self._owner = uuid.uuid4().hex
         self.lost: WriterLost | None = None
+        self._upserts: dict[str, Any] = {}
         try:
             parsed = sa.make_url(url)
         except sa.exc.ArgumentError as error:
@@ -286,6 +287,19 @@ class Connections:
         except StoreUnavailable:
             self.close()
             raise
+
+    def upsert(self, table: sa.Table, *keys: str) -> Any:
+        """Return the INSERT of a row with all columns of `table`; it updates the row with the same `keys`.
+
+        The values are parameters of `execute`: the statement is built and compiled once.
+        """
+        found = self._upserts.get(table.name)
+        if found is None:
+            statement, names = self.insert(table), [column.name for column in table.columns]
+            values = {name: statement.excluded[name] for name in names if name not in keys}
+            found = statement.on_conflict_do_update(index_elements=keys, set_=values)
+            self._upserts[table.name] = found
+        return found
 
     def close(self) -> None:
         """Close all connections and release the lock; idempotent."""

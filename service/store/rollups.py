@@ -7,7 +7,7 @@ After an upgrade, or a clock that was set back, they are added again, a bounded 
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -15,7 +15,7 @@ import sqlalchemy as sa
 
 from service.alarms.conditions import AlarmKind, Condition, Severity
 from service.alarms.state_machine import Alarm, Change, alarm_id, from_json
-from service.report.report import FeederReport
+from service.report.report import Kept
 from service.store.schema import ALARM, EVENT, HISTORY, LAYOUT, ROLLUP
 from service.store.series import (
     MAX_ROWS,
@@ -99,11 +99,11 @@ def _newest_rows(
 
 
 def add_rollups(
-    connection: sa.Connection, insert: Any, rolled: dict[str, float], report: FeederReport
+    connection: sa.Connection, upsert: Callable[..., Any], rolled: dict[str, float], report: Kept
 ) -> None:
     """Add the roll-ups of the finished buckets before a stored report.
 
-    insert: INSERT of the dialect, with ON CONFLICT.
+    upsert: `Connections.upsert`.
     rolled: end of the roll-ups of each feeder, Unix s; updated.
     """
     h, r, feeder = HISTORY.c, ROLLUP.c, report.feeder
@@ -131,11 +131,7 @@ def add_rollups(
         .order_by(h.t)
     )
     for row in roll_up(connection.execute(query).all(), end):
-        values = {"feeder": feeder, **row}
-        statement = insert(ROLLUP).values(values)
-        connection.execute(
-            statement.on_conflict_do_update(index_elements=["feeder", "t", "layout"], set_=values)
-        )
+        connection.execute(upsert(ROLLUP, "feeder", "t", "layout"), {"feeder": feeder, **row})
     rolled[feeder] = end
 
 

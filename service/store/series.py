@@ -21,46 +21,23 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats
 from gridsec.interface import Cause, Decision
-from service.report.report import BUSBAR, FeederReport, MeterState, finite
+from service.report.report import BUSBAR, HISTORY_COLUMNS, HistoryRow, finite
 
 # --- Rows ---
 
-_VERSION_1: Final = ("v_volt_reported", "v_volt_estimated", "score", "threshold")
-_COLUMNS: Final = (*_VERSION_1, "v_volt_std")
+_VERSION_1: Final = HISTORY_COLUMNS[:4]
+_COLUMNS: Final = HISTORY_COLUMNS
 _VERSION: Final = b"\x02"
 """First byte of a row. A row of version 1 has none, and begins with zlib's 0x78."""
 _SEEN, _SUSPECT, _MODEL_ONLY = 1, 2, 4
 _REPORTED, _ESTIMATED, _STD = (_COLUMNS.index(f"v_volt_{name}") for name in ("reported", "estimated", "std"))
 
 
-def rows(report: FeederReport) -> tuple[MeterState, ...]:
-    """Return the meters of a row: those of the report, and the busbar meter as `BUSBAR`, without a score."""
-    now = report.busbar
-    busbar = MeterState(
-        meter=BUSBAR,
-        bus=report.buses[0].bus if report.buses else "",
-        seen=now.seen,
-        suspect=now.suspect,
-        score=None,
-        threshold=None,
-        v_volt_reported=now.v_volt_reported,
-        v_volt_estimated=now.v_volt_estimated,
-        v_volt_std=None,
-        v2_pu_estimated=None,
-        attack_volt_estimated=now.attack_volt_estimated,
-        model_only=now.model_only,
-    )
-    return (*report.meters, busbar)
-
-
-def pack(meters: Sequence[MeterState]) -> bytes:
-    """Pack the meters of a report: five float32 columns (NaN for None), then one byte of flags each."""
-    none = math.nan
-    table = np.array(
-        [[none if (v := getattr(m, name)) is None else v for m in meters] for name in _COLUMNS], dtype="<f4"
-    )
-    flags = bytes(_SEEN * m.seen | _SUSPECT * m.suspect | _MODEL_ONLY * m.model_only for m in meters)
-    return _VERSION + zlib.compress(table.tobytes() + flags, 6)
+def pack(row: HistoryRow) -> bytes:
+    """Pack the meters of a tick: five float32 columns, then one byte of flags each."""
+    seen, suspect, model_only = row.flags.astype(np.uint8)
+    flags = _SEEN * seen | _SUSPECT * suspect | _MODEL_ONLY * model_only
+    return _VERSION + zlib.compress(row.values.astype("<f4").tobytes() + flags.tobytes(), 6)
 
 
 def _opened(data: bytes) -> tuple[bytes, int]:

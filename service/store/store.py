@@ -14,6 +14,7 @@ import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -22,7 +23,7 @@ import structlog
 
 from service.alarms.incidents import Action, IncidentEvent, Shelf
 from service.alarms.state_machine import Alarm, AlarmState, AlarmTransition, Change, from_json, to_json
-from service.report.report import FeederReport
+from service.report.report import Kept
 from service.store import incidents
 from service.store.connect import Connections
 from service.store.incidents import IncidentReader
@@ -61,7 +62,7 @@ from service.store.schema import (
     migrate,
     words_of,
 )
-from service.store.series import HistoryRules, Mark, Series, mark, pack, rows, unpack, worth_keeping
+from service.store.series import HistoryRules, Mark, Series, mark, pack, unpack, worth_keeping
 from service.store.state_codec import SnapshotKind, StateSnapshot
 
 T = TypeVar("T", bound="AlarmEvent | IncidentEvent")
@@ -581,7 +582,7 @@ class Store(Reader):
         self,
         transitions: Iterable[AlarmTransition] = (),
         *,
-        reports: Iterable[FeederReport] = (),
+        reports: Iterable[Kept] = (),
         rejected: Iterable[Rejected] = (),
         kept: Iterable[StateSnapshot] = (),
         happened: Iterable[CommissioningEvent] = (),
@@ -761,11 +762,9 @@ class Store(Reader):
             row = {"feeder": item.feeder, "t": item.t, "data": item.text}
             subjects.setdefault(item.matter, []).append(row)
         for matter, new in subjects.items():
-            statement = self._connections.insert(_KEPT[matter])
-            columns = {name: statement.excluded[name] for name in ("t", "data")}
-            connection.execute(statement.on_conflict_do_update(index_elements=["feeder"], set_=columns), new)
+            connection.execute(self._connections.upsert(_KEPT[matter], "feeder"), new)
 
-    def _worth(self, marks: dict[str, Mark], report: FeederReport) -> bool:
+    def _worth(self, marks: dict[str, Mark], report: Kept) -> bool:
         """True if a report gets a row; later ones are then compared with it."""
         now = mark(report)
         worth = worth_keeping(marks.get(report.feeder), now, self._history_rules)
@@ -774,24 +773,25 @@ class Store(Reader):
         return worth
 
     def _put_history(
-        self, connection: sa.Connection, reports: Sequence[FeederReport], rolled: dict[str, float]
+        self, connection: sa.Connection, reports: Sequence[Kept], rolled: dict[str, float]
     ) -> None:
-        layouts = self._layouts(connection, reports)
-        for report in reports:
-            row = {
+        found = [(report, report.row) for report in reports]
+        layouts = self._layouts(connection, {row.meters for _, row in found})
+        put = self._connections.upsert(HISTORY, "feeder", "t")
+        for report, row in found:
+            values = {
                 "feeder": report.feeder,
                 "t": report.t,
                 "verdict": str(report.verdict),
                 "cause": str(report.cause),
-                "layout": layouts[_meters(report)],
-                "data": pack(rows(report)),
+                "layout": layouts[row.meters],
+                "data": pack(row),
             }
-            statement = self._connections.insert(HISTORY).values(row)
-            connection.execute(statement.on_conflict_do_update(index_elements=["feeder", "t"], set_=row))
+            connection.execute(put, values)
             self._prune(connection, report)
-            add_rollups(connection, self._connections.insert, rolled, report)
+            add_rollups(connection, self._connections.upsert, rolled, report)
 
-    def _prune(self, connection: sa.Connection, report: FeederReport) -> None:
+    def _prune(self, connection: sa.Connection, report: Kept) -> None:
         """Delete old history, with the first row after a start and then every `_PRUNE_EVERY` rows."""
         before = self._since_prune.get(report.feeder)
         count = 0 if before is None or before + 1 >= _PRUNE_EVERY else before + 1
@@ -816,9 +816,12 @@ class Store(Reader):
         )
         prune_rollups(connection, pruned(ROLLUP), report.t - keep, limit=_PRUNED_AT_ONCE)
 
-    def _layouts(self, connection: sa.Connection, reports: Sequence[FeederReport]) -> dict[str, int]:
-        """Return the ids of the layouts of reports, by their meters; new ones are stored."""
-        digests = {digest(meters): meters for meters in map(_meters, reports)}
+    def _layouts(
+        self, connection: sa.Connection, wanted: Iterable[tuple[str, ...]]
+    ) -> dict[tuple[str, ...], int]:
+        """Return the ids of layouts by their meters; new ones are stored."""
+        texts = {meters: _layout(meters) for meters in wanted}
+        digests = dict(texts.values())
         known = sa.select(LAYOUT.c.digest, LAYOUT.c.id).where(LAYOUT.c.digest.in_(digests))
         found = {row.digest: row.id for row in connection.execute(known)}
         # In one order: two workers that add the same layouts wait for each other only once.
@@ -826,7 +829,7 @@ class Store(Reader):
         if new:
             connection.execute(self._connections.insert(LAYOUT).on_conflict_do_nothing(), new)
             found = {row.digest: row.id for row in connection.execute(known)}
-        return {meters: int(found[key]) for key, meters in digests.items()}
+        return {meters: int(found[key]) for meters, (key, _) in texts.items()}
 
 
 _ALL = 1_000_000
@@ -847,8 +850,11 @@ def _selected(
         after = page[-1].seq
 
 
-def _meters(report: FeederReport) -> str:
-    return json.dumps([meter.meter for meter in rows(report)])
+@lru_cache(maxsize=1024)
+def _layout(meters: tuple[str, ...]) -> tuple[str, str]:
+    """Digest and text of the layout of a row."""
+    text = json.dumps(meters)
+    return digest(text), text
 
 
 def _count_change(connection: sa.Connection) -> int:

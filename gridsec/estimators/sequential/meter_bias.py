@@ -35,7 +35,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from enum import StrEnum
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -431,21 +431,35 @@ def progress(design: SequentialDesign, commission: Commission) -> LearningProgre
     expected, learning = expected_s(design), commission.learning
     p = commission.learned.at.size
     if learning is None:
-        return LearningProgress((LearningState.LEARNED,) * p, (None,) * p, expected)
+        return LearningProgress(*_by_number(bytes([3] * p), bytes([len(REASONS)] * p)), expected)
     late = learning.watched_s >= _PATIENCE * expected
-    states = (LearningState.WAITING, LearningState.LEARNING, LearningState.STALLED, LearningState.LEARNED)
-    number = np.where(learning.open, np.where(late, 2, np.where(learning.time_s > 0, 1, 0)), 3)
-    worst = np.where(_late(design, learning), learning.lost_s.argmax(axis=0), len(REASONS))
-    reasons = (*REASONS, None)
-    state = tuple(states[k] for k in number.tolist())
-    return LearningProgress(state, tuple(reasons[k] for k in worst.tolist()), expected)
+    number = np.where(late, 2, learning.time_s > 0)
+    number[~learning.open] = 3
+    behind = _late(design, learning)
+    worst = np.full(p, len(REASONS))
+    if any_of(behind):
+        worst = np.where(behind, learning.lost_s.argmax(axis=0), worst)
+    state, reason = _by_number(number.astype(np.int8).tobytes(), worst.astype(np.int8).tobytes())
+    return LearningProgress(state, reason, expected)
+
+
+_STATES = (LearningState.WAITING, LearningState.LEARNING, LearningState.STALLED, LearningState.LEARNED)
+
+
+@lru_cache(maxsize=256)
+def _by_number(
+    states: bytes, reasons: bytes
+) -> tuple[tuple[LearningState, ...], tuple[LearningReason | None, ...]]:
+    """States and reasons of meters, by their indices in `_STATES` and `REASONS`; None beyond the latter."""
+    return tuple(_STATES[k] for k in states), tuple((*REASONS, None)[k] for k in reasons)
 
 
 def _late(design: SequentialDesign, learning: Learning) -> Bools:
     """Meters that are learned later than expected, (p,): too few ticks counted, or nothing is concluded."""
     few = learning.time_s < design.options.enough * learning.watched_s
     held = learning.time_s >= design.options.commission_s
-    return np.asarray(learning.open & (few | held) & (learning.lost_s.max(axis=0) > 0))
+    behind = learning.open & (few | held)
+    return behind & (learning.lost_s.max(axis=0) > 0) if any_of(behind) else behind
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,6 +15,7 @@ docs/theory-sequential.md, section 5.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -385,7 +386,7 @@ class SuspicionRecord:
 
     def same(self, other: SuspicionRecord) -> bool:
         """True if the suspects are the same; the deviation of the busbar's meter does not count."""
-        return (
+        return self is other or (
             np.array_equal(self.scale_s, other.scale_s, equal_nan=True)
             and np.array_equal(self.repeats_s, other.repeats_s, equal_nan=True)
             and np.array_equal(self.named, other.named)
@@ -400,11 +401,14 @@ class SuspicionRecord:
         return replace(self, scale_s=scale_s, repeats_s=repeats_s, named=self.named & ~which)
 
     @staticmethod
+    @lru_cache(maxsize=256)
     def empty(meters: int, inverters: int, phases: int = 1) -> SuspicionRecord:
-        """Record without suspects."""
+        """Record without suspects; its arrays are read-only."""
         no, none, here = (np.zeros(count, dtype=np.bool_) for count in (meters, inverters, phases))
-        never = np.full(meters, np.nan)
-        return SuspicionRecord(never, never, no, none, np.full(phases, np.nan), here, np.zeros(phases))
+        never, unnamed, off = np.full(meters, np.nan), np.full(phases, np.nan), np.zeros(phases)
+        for each in (no, none, here, never, unnamed, off):
+            each.flags.writeable = False
+        return SuspicionRecord(never, never, no, none, unnamed, here, off)
 
 
 def distrusted(design: SequentialDesign, state: SequentialState) -> SuspicionRecord:

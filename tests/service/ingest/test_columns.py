@@ -83,8 +83,12 @@ def test_columns_are_validated_as_single_readings(rows: list[dict[str, Any]]) ->
         assert decoded(json.dumps(full).encode(), "") == good
 
 
-@given(st.lists(ROW, min_size=1, max_size=12))
-def test_arrow_columns_are_validated_as_single_readings(rows: list[dict[str, Any]]) -> None:
+ARROW = "application/vnd.apache.arrow.stream"
+
+
+def arrow_of(rows: list[dict[str, Any]], chunk: int) -> tuple[bytes, list[dict[str, Any]]]:
+    """Rows as a payload of record batches of `chunk` rows, and in the types of its columns."""
+
     def number(value: Any) -> float | None:
         return None if value is None else float(value)
 
@@ -106,9 +110,59 @@ def test_arrow_columns_are_validated_as_single_readings(rows: list[dict[str, Any
     )
     sink = pa.BufferOutputStream()
     with ipc.new_stream(sink, table.schema) as writer:
-        writer.write_table(table, max_chunksize=5)
+        writer.write_table(table, max_chunksize=chunk)
+    return sink.getvalue().to_pybytes(), full
+
+
+@given(st.lists(ROW, min_size=1, max_size=12))
+def test_arrow_columns_are_validated_as_single_readings(rows: list[dict[str, Any]]) -> None:
+    payload, full = arrow_of(rows, 5)
     good = [judged(row) for row in full if not isinstance(judge(row, KNOWN, in_batch=True), Findings)]
-    assert decoded(sink.getvalue().to_pybytes(), "application/vnd.apache.arrow.stream") == good
+    assert decoded(payload, ARROW) == good
+
+
+PLAIN = st.fixed_dictionaries(
+    {
+        "t": st.sampled_from([T0, T0 + 1.0, T0 + 2.0, 0.0]),
+        "v_volt": st.sampled_from([230.0, 231.5, 2309.5, math.nan]),
+        "p_kw": st.sampled_from([1.0, -2.0, 1e5, math.nan, None]),
+        "seq": st.sampled_from([3, 4, -1, None]),
+    }
+)
+
+
+@given(st.lists(st.lists(PLAIN, min_size=3, max_size=4), min_size=2, max_size=6), st.booleans())
+def test_a_repeated_layout_changes_no_result(rounds: list[list[dict[str, Any]]], other: bool) -> None:
+    """Payloads that differ in numbers, nulls, lengths or meters are each decoded as by a new decoder."""
+    lasting = Wire({"village": Known(METERS, 230.94, 10_000.0)})
+    for number, rows in enumerate(rounds):
+        names = "cabz" if other and number % 2 else "cabd"
+        payload, _ = arrow_of([{"meter": name, **row} for name, row in zip(names, rows, strict=False)], 5)
+        new = Wire({"village": Known(METERS, 230.94, 10_000.0)})
+        found, expected = (one.decode(BATCH, payload, ARROW, arrival=T0 + number) for one in (lasting, new))
+        assert found.bad == expected.bad
+        assert (found.readings is None) == (expected.readings is None)
+        if found.readings is not None and expected.readings is not None:
+            for name in ("source", "values", "seq", "arrival"):
+                each = (getattr(one.readings, name) for one in (found, expected))
+                np.testing.assert_array_equal(*each, strict=True)
+
+
+def test_the_layout_of_a_payload_reads_other_numbers() -> None:
+    known = Known(METERS, 230.94, 10_000.0)
+    rows = [{"meter": name, "t": T0, "v_volt": 230.0 + k, "seq": k} for k, name in enumerate("cab")]
+    payload, _ = arrow_of(rows, 5)
+    later, _ = arrow_of([row | {"v_volt": 240.0, "t": T0 + 1.0} for row in rows], 5)
+    renamed, _ = arrow_of([row | {"meter": name} for row, name in zip(rows, "abc", strict=True)], 5)
+    with_null, _ = arrow_of([rows[0], rows[1] | {"seq": None}, rows[2]], 5)
+    Wire({"village": known}).decode(BATCH, payload, ARROW)
+    ((layout, source),) = known.layouts.values()
+    assert source.tolist() == [2, 0, 1]
+    columns = layout.columns(later)
+    assert columns is not None
+    assert columns["v_volt"].values.tolist() == [240.0, 240.0, 240.0]
+    assert columns["seq"].values.tolist() == [0, 1, 2]
+    assert [layout.columns(one) for one in (renamed, with_null, later[:-8], later + b"\0")] == [None] * 4
 
 
 @given(st.lists(st.tuples(st.sampled_from(ALL), ROW), min_size=1, max_size=12))
@@ -162,8 +216,9 @@ def arrivals(r: random.Random, tick_s: float) -> list[list[tuple[float, Reading]
         base, rows = k * tick_s, list[tuple[float, Reading]]()
         kind = r.choice(["scan", "scan", "late", "twice", "backlog", "chaos"])
         scans = range(r.randint(2, 8)) if kind == "backlog" else range(1)
+        order = ALL if r.random() < 0.5 else r.sample(ALL, r.randint(9, len(ALL)))
         for back in reversed(scans):
-            for meter in ALL:
+            for meter in order:
                 seq += r.choice([1, 1, 3])
                 t = (
                     base

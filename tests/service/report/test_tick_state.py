@@ -16,6 +16,7 @@ from service.alarms.conditions import conditions
 from service.alarms.state_machine import AlarmBook, AlarmRules, AlarmTransition, advance
 from service.engine.feeder_monitor import TickResult
 from service.engine.replay import ReplayCounts, replay
+from service.store.series import mark
 from tests.service.liars import FEEDER, START
 
 
@@ -66,6 +67,11 @@ def test_alarms_are_those_of_whole_reports(site: Site, scene: str) -> None:
         assert state.inverters == sum(one.suspect for one in state.report.inverters)
         assert state.model_only == state.report.model_only
         assert (state.verdict, state.cause) == (state.report.verdict, state.report.cause)
+        kept = state.kept()
+        assert mark(kept) == mark(state.report)
+        assert kept.row.meters == state.report.row.meters
+        np.testing.assert_array_equal(kept.row.values, state.report.row.values)
+        np.testing.assert_array_equal(kept.row.flags, state.report.row.flags)
         told += transitions
     assert bool(told) == (scene != "calm")
     assert calm > 10 or scene != "calm"

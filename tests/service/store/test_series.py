@@ -148,11 +148,12 @@ def test_rows_of_version_1_stay_readable_and_have_no_band(tmp_path: Path) -> Non
         with store._connections.write() as connection:
             connection.execute(ROLLUP.delete())
             for one in reports:
+                meters = (*one.meters, one.busbar)
                 table = [
-                    [math.nan if (v := getattr(m, name)) is None else v for m in codec.rows(one)]
+                    [math.nan if (v := getattr(m, name, None)) is None else v for m in meters]
                     for name in ("v_volt_reported", "v_volt_estimated", "score", "threshold")
                 ]
-                flags = bytes(m.seen + 2 * m.suspect + 4 * m.model_only for m in codec.rows(one))
+                flags = bytes(m.seen + 2 * m.suspect + 4 * m.model_only for m in meters)
                 old = zlib.compress(np.array(table, dtype="<f4").tobytes() + flags, 6)
                 row = unpack(old, ids, "m0")["meter"]
                 assert row["v_volt_std"] is None
