@@ -52,8 +52,9 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.estimators.modal import core, detector, estimate, full, signatures, static
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.core import Core
+from gridsec.estimators.modal.costs import SearchProblem
 from gridsec.estimators.modal.estimate import Estimated
-from gridsec.estimators.modal.search import Identification, SearchProblem
+from gridsec.estimators.modal.search import Identification
 from gridsec.estimators.sequential import SequentialDesign
 from gridsec.interface import Decision, Frame
 

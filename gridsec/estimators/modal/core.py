@@ -26,15 +26,17 @@ from gridsec.errors import InputInvalid, Problem
 from gridsec.estimators.modal import detector, full, masking, mirrors, replay, rivals, signatures, static
 from gridsec.estimators.modal import estimate as estimates
 from gridsec.estimators.modal import filter as modal
+from gridsec.estimators.modal.costs import SearchProblem, cost
 from gridsec.estimators.modal.detector import SIZE, Detector, Evidence
 from gridsec.estimators.modal.estimate import Estimated, Estimator
 from gridsec.estimators.modal.filter import FilterState, Update
+from gridsec.estimators.modal.laterals import groups
 from gridsec.estimators.modal.masking import Masked
 from gridsec.estimators.modal.mirrors import Neighbourhoods
 from gridsec.estimators.modal.model import Modes, ResidualModel, modes, residual_model
 from gridsec.estimators.modal.replay import History, Parts, Suspected
 from gridsec.estimators.modal.rivals import Rival
-from gridsec.estimators.modal.search import Identification, SearchProblem, cost, groups, search
+from gridsec.estimators.modal.search import Identification, search
 from gridsec.estimators.modal.signatures import Columns, Joint
 from gridsec.estimators.modal.static import Static
 from gridsec.estimators.sequential.design import YEAR_S, SequentialDesign

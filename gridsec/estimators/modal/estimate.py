@@ -12,7 +12,7 @@ linear in the posterior of (w, b, theta), and its variance follows.
 
 A fault f at an onset moves the filter by its signature g and the residuals by u f; false powers and a false
 busbar voltage move the model as well, by ``effect``. With amounts of the mean f and the covariance of
-`gridsec.estimators.modal.search`, the estimate moves by ``T f`` and its variance grows by ``diag(T cov T')``.
+`gridsec.estimators.modal.costs`, the estimate moves by ``T f`` and its variance grows by ``diag(T cov T')``.
 Several explanations are mixed with their weights; their disagreement is part of the variance.
 
 References
@@ -29,9 +29,10 @@ from functools import cached_property, partial
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, indices, submatrix
+from gridsec.estimators.modal.costs import SearchProblem, amounts, mean_amounts
 from gridsec.estimators.modal.filter import FilterState, Full, Update
 from gridsec.estimators.modal.model import Modes
-from gridsec.estimators.modal.search import Identification, SearchProblem, amounts, mean_amounts
+from gridsec.estimators.modal.search import Identification
 from gridsec.estimators.modal.signatures import Joint
 from gridsec.estimators.modal.static import Static
 from gridsec.estimators.sequential.output import PENDING, BoundedEstimate, BoundInputs

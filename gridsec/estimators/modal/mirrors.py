@@ -28,16 +28,10 @@ import numpy as np
 from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Ints, any_of, submatrix
+from gridsec.estimators.modal.costs import BELIEVED, SearchProblem, informed
+from gridsec.estimators.modal.laterals import clusters, coded
 from gridsec.estimators.modal.model import Modes
-from gridsec.estimators.modal.search import (
-    BELIEVED,
-    DOUBT,
-    Identification,
-    SearchProblem,
-    clusters,
-    coded,
-    informed,
-)
+from gridsec.estimators.modal.search import DOUBT, Identification
 
 REFLECTED = 0.01
 """Weight from which on an explanation has mirror images, 1: that of reported explanations."""

@@ -26,8 +26,9 @@ from gridsec.arrays import Bools, Floats, all_of, any_of, indices
 from gridsec.estimators.detection import DecisionInputs, decide
 from gridsec.estimators.modal import masking, signatures
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
+from gridsec.estimators.modal.costs import amounts
 from gridsec.estimators.modal.detector import SIZE, WEIGHTS, Evidence
-from gridsec.estimators.modal.search import DOUBT, amounts
+from gridsec.estimators.modal.search import DOUBT
 from gridsec.estimators.plant import NO_VOLTAGE
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.device_checks import probability

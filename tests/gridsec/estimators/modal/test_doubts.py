@@ -6,11 +6,11 @@ import numpy as np
 
 from benchmarks._residuals import Dense, Source, power_columns, tree
 from gridsec.arrays import Floats
-from gridsec.estimators.modal import core, doubts, full, search, static
+from gridsec.estimators.modal import core, costs, doubts, full, static
 from gridsec.estimators.modal import filter as modal
+from gridsec.estimators.modal.costs import SearchProblem
 from gridsec.estimators.modal.doubts import Unknown
 from gridsec.estimators.modal.model import modes
-from gridsec.estimators.modal.search import SearchProblem
 from gridsec.estimators.modal.signatures import Joint
 from tests.gridsec.estimators.modal.test_core import MODEL
 from tests.gridsec.estimators.modal.test_filter import proportional
@@ -111,7 +111,7 @@ def test_the_search_integrates_lasting_errors_out() -> None:
     )
     for chosen in random.random((5, plain.y.size)) < 0.2:
         both = np.append(chosen, [True, True])
-        assert np.isclose(search.cost(reduced, chosen) - 2.0 * gain, search.cost(whole, both))
+        assert np.isclose(costs.cost(reduced, chosen) - 2.0 * gain, costs.cost(whole, both))
 
 
 def test_a_lasting_error_does_not_decide_between_meters_over_time() -> None:
@@ -129,5 +129,5 @@ def test_a_lasting_error_does_not_decide_between_meters_over_time() -> None:
         if k in (60, 339):
             problem, _ = core._problem(kernel, state.suspected[0].joint(kernel.modes), unknown)
             sets = (np.arange(problem.y.size) == 9, np.isin(np.arange(problem.y.size), (10, 11)))
-            odds.append(search.cost(problem, sets[0]) - search.cost(problem, sets[1]))
+            odds.append(costs.cost(problem, sets[0]) - costs.cost(problem, sets[1]))
     assert abs(odds[1] - odds[0]) < 10.0

@@ -11,8 +11,9 @@ from benchmarks._residuals import Source, model_of, power_columns, root, tree
 from gridsec.arrays import Floats
 from gridsec.estimators.modal import estimate, full, signatures, static
 from gridsec.estimators.modal import filter as modal
+from gridsec.estimators.modal.costs import SearchProblem, amounts
 from gridsec.estimators.modal.model import ResidualModel, modes
-from gridsec.estimators.modal.search import Identification, SearchProblem, amounts
+from gridsec.estimators.modal.search import Identification
 from gridsec.grid.network import Power
 
 FEEDER = tree(9, np.random.default_rng(1))

@@ -1,0 +1,405 @@
+"""Exact posterior costs of sets of faults.
+
+At one onset, the scores y (q,) and the information F (q, q) of `gridsec.estimators.modal.signatures` say
+everything about the amounts of q possible faults: meters, false powers, busbar. For a subset J with amounts
+N(0, s_j^2), twice the negative logarithm of its posterior probability, up to a constant, is
+
+    cost(J) = -y_J' (F_JJ + diag(1 / s_J^2))^-1 y_J + log det(I + diag(s_J^2) F_JJ) + penalty(J)
+    penalty = 2 log binom(p, k) for k of p meters, plus a charge for every other fault
+
+Every number of meters is as likely as any other, and every set of one size as any other of that size.
+
+**Tableau.** The sweep operator keeps ``[F + 1 / s^2, y; y', 0]`` pivoted on J, so that the costs of all sets
+that differ by one addition, removal or exchange are read off, O(q) to O(k q); a step is O(q^2). A group of
+neighbours is added or removed at once.
+
+References
+----------
+.. [1] Goodnight, A tutorial on the SWEEP operator, The American Statistician 33, 1979.
+.. [2] Chen and Chen, Extended Bayesian information criteria, Biometrika 95, 2008.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from math import inf, log
+
+import numpy as np
+from scipy.linalg import blas, cho_solve, cholesky, lapack
+
+from gridsec.arrays import Bools, Floats, Ints, frozen, submatrix
+
+MAJORITY = 9.0
+"""Least penalty of a meter beyond a third of all, in units of the cost: three standard deviations."""
+BELIEVED = 1e-8
+"""Weight below which a set is not kept, 1: far below the doubt at which a meter is not named."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SearchProblem:
+    """Scores and information of q faults at one onset; the meters come first.
+
+    Attributes
+    ----------
+    y : (q,)
+        Scores.
+    F : (q, q)
+        Information.
+    std : (q,)
+        Prior standard deviations of the amounts.
+    meters
+        Number of meters, p.
+    charge : (q,)
+        Penalty of each fault that is not a meter, in units of the cost; 0 for meters.
+    bound : (q,)
+        Largest amount that is possible; infinite for none.
+    """
+
+    y: Floats
+    F: Floats = field(repr=False)
+    std: Floats
+    meters: int
+    charge: Floats
+    bound: Floats
+
+
+@lru_cache(maxsize=16)
+def penalties(meters: int) -> Floats:
+    """Penalty of k of p meters, for k = 0 to p, (p + 1,).
+
+    Parameters
+    ----------
+    meters
+        p.
+    """
+    k = np.arange(meters)
+    more = 2.0 * np.log((meters - k) / (k + 1.0))
+    more = np.where(k >= max(1, meters // 3), np.maximum(more, MAJORITY), more)
+    return frozen(np.concatenate([[0.0], np.cumsum(more)]))
+
+
+def penalty(problem: SearchProblem, chosen: Bools) -> float:
+    """Penalty of one set, (q,)."""
+    count = int(np.count_nonzero(chosen[: problem.meters]))
+    return float(penalties(problem.meters)[count] + problem.charge[chosen].sum())
+
+
+def informed(problem: SearchProblem) -> Bools:
+    """Meters with readings since the onset, (p,): the information about others is zero."""
+    return np.asarray(problem.F.diagonal()[: problem.meters] > np.finfo(np.float64).tiny)
+
+
+def cost(problem: SearchProblem, chosen: Bools) -> float:
+    """Cost of one set; O(k^3).
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    chosen : (q,)
+        The set.
+    """
+    at = np.flatnonzero(chosen)
+    out = penalty(problem, chosen)
+    if at.size:
+        half = cholesky(problem.F[np.ix_(at, at)] + np.diag(problem.std[at] ** -2.0), lower=True)
+        out -= float(problem.y[at] @ cho_solve((half, True), problem.y[at]))
+        out += 2.0 * float(np.log(np.diag(half)).sum() + np.log(problem.std[at]).sum())
+    return out
+
+
+def costs(problem: SearchProblem, sets: Bools, share: float = 0.0) -> Floats:
+    """Costs of some sets with a share of the meters' variance in common, (k,).
+
+    The amounts have the prior covariance ``s^2 (share 1 1' + (1 - share) I)``. With a share, a set bears the
+    largest charge besides: an unreported load moves neighbours alike as well. With the posterior mean m and
+    covariance G of amounts without the common one, and ``w = 1 / (s (1 - share))`` for k meters, the score
+    and the information of the common amount are ``w' m`` and ``k / (1 - share) - w' G w``. The factor of the
+    faults that all sets have is computed once; each set then takes O(n^3) for n others.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    sets : (k, q)
+        The sets.
+    share
+        Share in common, 0 to 1.
+    """
+    meters = np.count_nonzero(sets[:, : problem.meters], axis=1)
+    out = penalties(problem.meters)[meters] + (problem.charge.max(initial=0.0) if share else 0.0)
+    problem, sets = _among(problem, np.logical_or.reduce(sets, axis=0)), sets[:, sets.any(axis=0)]
+    p, q, shared = problem.meters, problem.y.size, np.logical_and.reduce(sets, axis=0)
+    std = np.where(np.arange(q) < p, np.sqrt(1.0 - share), 1.0) * problem.std
+    base = Tableau(replace(problem, std=std)).pivot(shared)
+    at, inside = padded(sets & ~shared)
+    n, J = np.arange(at.shape[1]), np.flatnonzero(shared[:p])
+    A = base.A[at[:, :, None], at[:, None, :]] * (inside[:, :, None] & inside[:, None, :])
+    A[:, n, n] += ~inside
+    pulls = [np.where(inside, base.A[at, q], 0.0)]
+    if share:
+        w = np.where(np.arange(q) < p, 1.0 / (problem.std * (1.0 - share)), 0.0)
+        felt = w - w[J] @ base.A[J, :q]
+        pulls.append(np.where(inside, felt[at], 0.0))
+    log_det, inner = _inner(A, np.stack(pulls, axis=1))
+    out = out + base.cost - base.penalty[base.count] + log_det - inner[:, 0, 0]
+    out += np.where(inside, (base.size + problem.charge)[at], 0.0).sum(axis=1)
+    if share:
+        score = w[J] @ base.A[J, q] + inner[:, 0, 1]
+        information = meters / (1.0 - share) + w[J] @ base.A[np.ix_(J, J)] @ w[J] - inner[:, 1, 1]
+        information = np.maximum(information, 0.0)
+        out += np.log1p(share * information) - score * score / (information + 1.0 / share)
+    return np.asarray(out)
+
+
+def _among(problem: SearchProblem, used: Bools) -> SearchProblem:
+    """The problem with some faults (q,) only."""
+    at = np.flatnonzero(used)
+    return SearchProblem(
+        problem.y[at],
+        submatrix(problem.F, at, at),
+        problem.std[at],
+        int(np.count_nonzero(used[: problem.meters])),
+        problem.charge[at],
+        problem.bound[at],
+    )
+
+
+def padded(sets: Bools) -> tuple[Ints, Bools]:
+    """Members of sets, filled up to the same number, and where they are members, (k, n) each.
+
+    Parameters
+    ----------
+    sets : (k, q)
+        The sets.
+    """
+    count = np.count_nonzero(sets, axis=1)
+    inside = np.arange(int(count.max(initial=0))) < count[:, None]
+    at = np.zeros(inside.shape, dtype=np.intp)
+    at[inside] = np.nonzero(sets)[1]
+    return at, inside
+
+
+def _fits(A: Floats, v: Floats) -> tuple[Floats, Floats]:
+    """``log det A`` and ``v' A^-1 v`` of leading blocks of stacked definite matrices, (k, n) each."""
+    # The last row of the Cholesky factor of [A, v; v', c] is (half^-1 v)', for any c that is large enough.
+    k, n = v.shape
+    bordered = np.empty((k, n + 1, n + 1))
+    bordered[:, :n, :n] = A
+    bordered[:, n, :n] = bordered[:, :n, n] = v
+    bordered[:, n, n] = _HUGE
+    half = np.linalg.cholesky(bordered)
+    white, diagonal = half[:, n, :n], np.einsum("kii->ki", half)[:, :n]
+    return 2.0 * np.cumsum(np.log(diagonal), axis=1), np.cumsum(white * white, axis=1)
+
+
+def _inner(A: Floats, v: Floats) -> tuple[Floats, Floats]:
+    """``log det A`` (k,) and ``v A^-1 v'`` (k, r, r) of stacked definite matrices and rows v (k, r, n)."""
+    k, r, n = v.shape
+    bordered = np.empty((k, n + r, n + r))
+    bordered[:, :n, :n] = A
+    bordered[:, n:, :n], bordered[:, :n, n:] = v, v.transpose(0, 2, 1)
+    bordered[:, n:, n:] = _HUGE * np.eye(r)
+    half = np.linalg.cholesky(bordered)
+    white, diagonal = half[:, n:, :n], np.einsum("kii->ki", half)[:, :n]
+    return 2.0 * np.log(diagonal).sum(axis=1), white @ white.transpose(0, 2, 1)
+
+
+_HUGE = 1e200
+"""Above all ``v' A^-1 v``."""
+
+
+def amounts(problem: SearchProblem, chosen: Bools) -> tuple[Floats, Floats]:
+    """Posterior mean (k,) and covariance (k, k) of the amounts of a set.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    chosen : (q,)
+        The set.
+    """
+    at = np.flatnonzero(chosen)
+    cov = np.asarray(np.linalg.inv(problem.F[np.ix_(at, at)] + np.diag(problem.std[at] ** -2.0)), np.float64)
+    return cov @ problem.y[at], cov
+
+
+def mean_amounts(problem: SearchProblem, chosen: Bools) -> Floats:
+    """Posterior mean of the amounts of a set, (k,): a third of the time of `amounts`."""
+    at = np.flatnonzero(chosen)
+    if not at.size:
+        return np.zeros(0)
+    A = problem.F[np.ix_(at, at)]
+    A[np.diag_indices(at.size)] += problem.std[at] ** -2.0
+    return np.asarray(lapack.dposv(A, problem.y[at], lower=True)[1])
+
+
+class Tableau:
+    """Sweep tableau of one problem, pivoted on a set.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    """
+
+    def __init__(self, problem: SearchProblem) -> None:
+        q = problem.y.size
+        self.problem, self.penalty = problem, penalties(problem.meters)
+        self.A = np.empty((q + 1, q + 1), order="F")
+        self.A.T[:q, :q] = problem.F
+        self.A[np.arange(q), np.arange(q)] += problem.std**-2.0
+        self.A[q, :q] = self.A[:q, q] = problem.y
+        self.A[q, q] = 0.0
+        self.chosen = np.zeros(q, dtype=np.bool_)
+        self.barred = np.zeros(q, dtype=np.bool_)
+        self.cost = 0.0
+        self.size = 2.0 * np.log(problem.std)
+
+    def pivot(self, chosen: Bools) -> Tableau:
+        """The same, pivoted on a set in place of none; O(q^2 k).
+
+        Parameters
+        ----------
+        chosen : (q,)
+            The set.
+        """
+        J = np.flatnonzero(chosen)
+        if not J.size:
+            return self
+        columns = self.A[:, J]
+        half, _ = lapack.dpotrf(columns[J], lower=True, clean=True)
+        white = blas.dtrsm(1.0, half, columns, side=1, lower=1, trans_a=1)
+        beside = blas.dtrsm(1.0, half, white, side=1, lower=1)
+        inverse, _ = lapack.dpotri(half, lower=True)
+        beside[J] = -np.tril(inverse) - np.tril(inverse, -1).T
+        self.A -= white @ white.T
+        self.A[:, J], self.A[J] = beside, beside.T
+        self.cost = 2.0 * float(np.log(half.diagonal()).sum()) - float(white[-1] @ white[-1])
+        self.cost += float(self.size[J].sum() + self.problem.charge[J].sum())
+        self.chosen = chosen.copy()
+        self.cost += float(self.penalty[self.count])
+        return self
+
+    def copy(self) -> Tableau:
+        """A tableau that can be changed without changing this one."""
+        out = object.__new__(Tableau)
+        out.problem, out.penalty, out.size = self.problem, self.penalty, self.size
+        out.A, out.chosen, out.cost = self.A.copy(order="F"), self.chosen.copy(), self.cost
+        out.barred = self.barred.copy()
+        return out
+
+    @property
+    def count(self) -> int:
+        """Number of chosen meters."""
+        return int(np.count_nonzero(self.chosen[: self.problem.meters]))
+
+    def changes(self) -> Floats:
+        """Change of the cost by toggling each fault, (q,); inf where it is barred or would be impossible."""
+        q, k = self.chosen.size, self.count
+        a, v = self.A.diagonal()[:q], self.A[:q, q]
+        sign = np.where(self.chosen, -1.0, 1.0)
+        out = -v * v / a + np.where(self.chosen, np.log(np.abs(a)) - self.size, np.log(np.abs(a)) + self.size)
+        p = self.problem.meters
+        up = self.penalty[min(k + 1, p)] - self.penalty[k]
+        down = self.penalty[max(k - 1, 0)] - self.penalty[k]
+        out[:p] += np.where(self.chosen[:p], down, up)
+        out += sign * self.problem.charge
+        impossible = ~self.chosen & (np.abs(v) > self.problem.bound * np.abs(a))
+        return np.where(impossible | (self.barred & ~self.chosen) | (sign * a <= 0.0), inf, out)
+
+    def exchanges(self, out: Ints) -> Floats:
+        """Change of the cost by exchanging chosen faults `out` for others, (k, q); inf for itself.
+
+        Parameters
+        ----------
+        out : (k,)
+            Chosen faults.
+        """
+        p, q, k = self.problem.meters, self.chosen.size, self.count
+        a, v = self.A.diagonal()[:q], self.A[:q, q]
+        rows = self.A[out, :q] / a[out][:, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pivot = a - rows * self.A[out, :q]
+            pull = v - rows * v[out][:, None]
+            first = -(v[out] ** 2) / a[out] + np.log(-a[out]) - self.size[out] - self.problem.charge[out]
+            both = first[:, None] - pull**2 / pivot + np.log(pivot) + self.size + self.problem.charge
+            impossible = np.abs(pull) > self.problem.bound * np.abs(pivot)
+        meter = np.arange(q) < p
+        count = k - meter[out][:, None] + meter
+        both += self.penalty[np.minimum(count, p)] - self.penalty[k]
+        return np.where(self.chosen | self.barred | impossible | ~(pivot > 0.0), inf, both)
+
+    def toggled(self, members: Ints, inside: Bools) -> Floats:
+        """Change of the cost by toggling sets of meters, (k,).
+
+        With A and v of the set, ``-v' A^-1 v + log |det A|`` generalises that of one meter.
+
+        Parameters
+        ----------
+        members, inside : (k, g)
+            The sets, filled up to the same size, and where they are members.
+        """
+        q, p, n = self.chosen.size, self.problem.meters, np.arange(members.shape[1])
+        A = self.A[members[:, :, None], members[:, None, :]] * (inside[:, :, None] & inside[:, None, :])
+        A[:, n, n] += ~inside
+        v = np.where(inside, self.A[members, q], 0.0)
+        sign = np.where(self.chosen[members], -1.0, 1.0) * inside
+        out = np.linalg.slogdet(A)[1] + (sign * self.size[members]).sum(axis=1)
+        out -= (v * np.linalg.solve(A, v[:, :, None])[:, :, 0]).sum(axis=1)
+        count = self.count + sign.sum(axis=1).astype(np.intp)
+        return np.asarray(out + self.penalty[np.minimum(count, p)] - self.penalty[self.count])
+
+    def bar(self, j: int) -> None:
+        """Keep a fault outside from now on, and remove it if it is inside.
+
+        Parameters
+        ----------
+        j
+            The fault.
+        """
+        self.barred[j] = True
+        if self.chosen[j]:
+            self.toggle(j)
+
+    def toggle(self, j: int) -> None:
+        """Add a fault to the set, or remove it; O(q^2).
+
+        Parameters
+        ----------
+        j
+            The fault.
+        """
+        k, column, d = self.count, self.A[:, j].copy(), self.A[j, j]
+        self.A = blas.dger(-1.0 / d, column, column, a=self.A, overwrite_a=True)
+        pivot = column / (-d if self.chosen[j] else d)
+        self.A[j] = self.A[:, j] = pivot
+        self.A[j, j] = -1.0 / d
+        size = log(abs(d)) + (-self.size[j] if self.chosen[j] else self.size[j])
+        added = -1 if self.chosen[j] else 1
+        self.cost += size - column[-1] ** 2 / d + added * self.problem.charge[j]
+        self.chosen[j] = not self.chosen[j]
+        self.cost += self.penalty[self.count] - self.penalty[k]
+
+    def group(self, members: Ints, inside: Bools) -> Floats:
+        """Change of the cost by adding the first n meters of sequences, (k, g); inf for one meter or none.
+
+        The factor of a sequence contains those of its beginnings. Chosen meters stay chosen.
+
+        Parameters
+        ----------
+        members, inside : (k, g)
+            The sequences, filled up to the same length, and where they are members.
+        """
+        q, p = self.chosen.size, self.problem.meters
+        free = inside & ~self.chosen[members]
+        count, k = np.cumsum(free, axis=1), self.count
+        both = free[:, :, None] & free[:, None, :]
+        A = np.where(both, self.A[members[:, :, None], members[:, None, :]], 0.0)
+        A[:, np.arange(members.shape[1]), np.arange(members.shape[1])] += ~free
+        log_det, fit = _fits(A, np.where(free, self.A[members, q], 0.0))
+        size = np.cumsum(free * self.size[members], axis=1)
+        out = log_det + size - fit + self.penalty[np.minimum(k + count, p)] - self.penalty[k]
+        barred = np.logical_or.accumulate(free & self.barred[members], axis=1)
+        return np.where((count > 1) & ~barred, out, inf)

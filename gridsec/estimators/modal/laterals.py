@@ -1,0 +1,267 @@
+"""Neighbourhoods of meters: groups, laterals that are manipulated as a whole, and their sets with one amount.
+
+**Groups.** Nested clusters of the members by the correlation of their voltages: on a radial feeder nearly
+the subtrees. The search adds and removes them at once. `together` arranges them in a few sequences, of which
+every group is a beginning.
+
+**Laterals.** A whole lateral may be manipulated at once, with some exceptions: such a set has the penalty of
+`coded`, if that is less than that of its number of meters.
+
+**One amount.** Meters that are off by nearly one amount need one size instead of k. A descent by independent
+amounts does not find them: one amount at a time, none is worth its penalty. `Common` descends with one
+amount for all, from the best set and from the laterals with the best fit. A change by one meter costs O(1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from math import inf, log
+
+import numpy as np
+from scipy.cluster.hierarchy import linkage
+from scipy.special import gammaln
+
+from gridsec.arrays import Bools, Floats, Ints, frozen
+from gridsec.estimators.modal.costs import BELIEVED, SearchProblem, informed, penalties
+from gridsec.estimators.modal.model import Modes
+
+GAIN = 1e-9
+"""Least change of the cost that counts, 1: rounding."""
+
+
+def coded(sets: Bools, laterals: Floats, read: Bools) -> Floats:
+    """Penalties of sets of meters, by their number or as a lateral with exceptions, (k,).
+
+    A manipulation of a whole lateral, as by its concentrator, with i members left out and o other meters, has
+
+        2 log G + 2 log binom(|g|, i) + 2 log binom(p - |g|, o)
+
+    for G laterals g. The least of these and of `penalties` counts, for sets of at most a third.
+
+    Parameters
+    ----------
+    sets : (k, p)
+        The sets.
+    laterals : (G, p)
+        Members of the laterals, those with readings.
+    read : (p,)
+        Meters with readings: others are no exceptions.
+    """
+    count = np.count_nonzero(sets, axis=1)
+    out, sets, p = penalties(read.size)[count], sets & read, int(np.count_nonzero(read))
+    if not len(laterals):
+        return np.asarray(out)
+    count = np.count_nonzero(sets, axis=1)
+    size = laterals.sum(axis=1).astype(np.intp)
+    inside = (sets @ laterals.T).astype(np.intp)
+    choices = _log_binomials(p)
+    of_lateral = choices[size, size - inside] + choices[p - size, count[:, None] - inside]
+    whole = 2.0 * (log(len(laterals)) + of_lateral.min(axis=1))
+    return np.asarray(np.where(count <= max(1, read.size // 3), np.minimum(out, whole), out))
+
+
+def excess(sets: Bools, laterals: Floats, read: Bools) -> Floats:
+    """Excess of the penalties by numbers of meters over `coded`, (k,)."""
+    meters = sets[:, : read.size]
+    return np.asarray(penalties(read.size)[np.count_nonzero(meters, axis=1)] - coded(meters, laterals, read))
+
+
+@lru_cache(maxsize=16)
+def _log_binomials(p: int) -> Floats:
+    """Logarithms of binom(n, k) for n and k up to p, (p + 1, p + 1); infinite for k above n."""
+    n, k = np.ogrid[: p + 1, : p + 1]
+    with np.errstate(invalid="ignore"):
+        return frozen(
+            np.where(k > n, inf, gammaln(n + 1.0) - gammaln(k + 1.0) - gammaln(np.maximum(n - k, 0) + 1.0))
+        )
+
+
+class Common:
+    """A lateral with exceptions that is off by one amount, and the costs of all sets near it.
+
+    The scores and the information of the one amount are ``a = 1' y_J`` and ``b = 1' F_JJ 1``:
+
+        cost(J) = -a^2 / (b + 1 / s^2) + log(1 + s^2 b) + penalty(J)
+
+    with the penalty of `coded` for this lateral, or that of the number of meters.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    lateral : (p,)
+        Members of the lateral; none: the penalty of the number counts.
+    inside : (p,)
+        The set.
+    """
+
+    def __init__(self, problem: SearchProblem, lateral: Bools, inside: Bools) -> None:
+        p = problem.meters
+        self.y, self.F, self.s2 = problem.y[:p], problem.F[:p, :p], float(problem.std[0]) ** 2
+        self.penalty, self.lateral, self.inside = penalties(p), lateral, inside.copy()
+        self.size, self.choices = int(lateral.sum()), _log_binomials(p)
+        self.read = informed(problem)
+        self.others = int(np.count_nonzero(self.read & ~lateral))
+        self.rows = self.F @ self.inside
+        self.a, self.b = float(self.y @ self.inside), float(self.rows @ self.inside)
+        self.count = int(self.inside.sum())
+        self.kept = int(np.count_nonzero(self.inside & lateral))
+
+    def _costs(self, a: Floats, b: Floats, count: Ints, kept: Ints) -> Floats:
+        b = np.maximum(b, 0.0)
+        out = -a * a / (b + 1.0 / self.s2) + np.log1p(self.s2 * b)
+        if self.size:
+            left, other = self.choices[self.size], self.choices[self.others]
+            out += 2.0 * (left[self.size - kept] + other[count - kept])
+        else:
+            out += self.penalty[count]
+        return np.where(count > 0, out, inf)
+
+    @property
+    def cost(self) -> float:
+        """Cost of the set, without that of the choice of the lateral."""
+        each = np.array([self.a]), np.array([self.b]), np.array([self.count]), np.array([self.kept])
+        return float(self._costs(*each)[0])
+
+    def toggled(self) -> Floats:
+        """Cost after toggling each meter, (p,)."""
+        sign = np.where(self.inside, -1, 1)
+        b = self.b + 2.0 * sign * self.rows + self.F.diagonal()
+        out = self._costs(self.a + sign * self.y, b, self.count + sign, self.kept + sign * self.lateral)
+        return np.where(self.read, out, inf)
+
+    def descend(self) -> Common:
+        """Lower the cost by single meters until none of them helps."""
+        cost = self.cost
+        for _ in range(4 * self.inside.size):
+            one = self.toggled()
+            j = int(one.argmin())
+            if not one[j] < cost - GAIN:
+                break
+            self._toggle(j)
+            cost = float(one[j])
+        return self
+
+    def _toggle(self, j: int) -> None:
+        sign = -1.0 if self.inside[j] else 1.0
+        self.a += sign * float(self.y[j])
+        self.b += 2.0 * sign * float(self.rows[j]) + float(self.F[j, j])
+        self.rows += sign * self.F[j]
+        self.count += int(sign)
+        self.kept += int(sign * self.lateral[j])
+        self.inside[j] = not self.inside[j]
+
+
+def in_common(problem: SearchProblem, laterals: Floats, best: Bools) -> Bools:
+    """Sets of meters that are off by nearly one amount, with those that differ by one meter, (k, q).
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    laterals : (G, p)
+        Members of the laterals.
+    best : (q,)
+        The best set with independent amounts.
+    """
+    p, out = problem.meters, dict[bytes, Bools]()
+    none = np.zeros(p, dtype=np.bool_)
+    starts = [Common(problem, none, best[:p] & informed(problem))] if best[:p].any() else []
+    if len(laterals):
+        a, b = laterals @ problem.y[:p], ((laterals @ problem.F[:p, :p]) * laterals).sum(axis=1)
+        first = a * a / (np.maximum(b, 0.0) + problem.std[0] ** -2.0)
+        for k in np.argsort(-first, kind="stable")[:_COMMON]:
+            lateral = laterals[k] > 0.0
+            starts.append(Common(problem, lateral, lateral))
+    for start in starts:
+        end = start.descend()
+        near = end.toggled() < end.cost - 2.0 * log(BELIEVED)
+        for j in (-1, *np.flatnonzero(near)):
+            chosen = np.zeros(problem.y.size, dtype=np.bool_)
+            chosen[:p] = end.inside
+            if j >= 0:
+                chosen[j] = not chosen[j]
+            out[chosen.tobytes()] = chosen
+    return np.stack(list(out.values())) if out else np.zeros((0, problem.y.size), dtype=np.bool_)
+
+
+_COMMON = 8
+"""Number of laterals from which a descent with one amount starts: those with the best fit."""
+
+
+def groups(modes: Modes) -> tuple[Ints, ...]:
+    """Groups of neighbours of at most half of the members."""
+    return tuple(each for each in clusters(modes) if each.size <= modes.size // 2)
+
+
+def clusters(modes: Modes) -> tuple[Ints, ...]:
+    """Nested clusters of members by the correlation of their voltages, O(t^2 log t); the last has all.
+
+    Any network has them; on a radial feeder they are nearly the subtrees.
+    """
+    if modes.size < _FEWEST:
+        return ()
+    S = modes.model.loads(modes.at)
+    var = S.diagonal()
+    # Squared distance of two voltages: the variance of their difference.
+    distance = np.sqrt(np.maximum(var[:, None] + var - 2.0 * S, 0.0))
+    tree = linkage(distance[np.triu_indices(modes.size, 1)], method="average")
+    inside: list[Ints] = [np.array([k]) for k in range(modes.size)]
+    for one, other in tree[:, :2].astype(np.intp):
+        inside.append(np.sort(np.concatenate([inside[one], inside[other]])))
+    return tuple(inside[modes.size :])
+
+
+_FEWEST = 3
+
+Groups = tuple[tuple[Ints, Bools, Bools], ...]
+"""Sequences of meters: members, places in use, and places where a group ends, (k, g) each."""
+
+
+def together(groups: Sequence[Ints]) -> Groups:
+    """Sequences of which all groups are beginnings, those of similar lengths together.
+
+    A group is continued by the smallest group around it, unless a larger group in that one is. With nested
+    groups, the sequences are few, and most of them are short.
+
+    Parameters
+    ----------
+    groups
+        Groups of meters.
+    """
+    chains, last = list[tuple[list[int], list[int]]](), list[set[int]]()
+    for each in sorted((set(one.tolist()) for one in groups), key=len):
+        # The largest group inside is continued: it was added last.
+        at = max((k for k, one in enumerate(last) if one <= each), key=lambda k: len(last[k]), default=None)
+        if at is None:
+            at = len(chains)
+            chains.append(([], []))
+            last.append(set())
+        members, ends = chains[at]
+        members += sorted(each - last[at])
+        ends.append(len(members) - 1)
+        last[at] = each
+    out = list[tuple[Ints, Bools, Bools]]()
+    for some in similar([len(each) for each, _ in chains]):
+        at_, inside = filled([np.array(chains[k][0]) for k in some])
+        final = np.zeros_like(inside)
+        for row, k in enumerate(some):
+            final[row, chains[k][1]] = True
+        out.append((at_, inside, final))
+    return tuple(out)
+
+
+def similar(sizes: Sequence[int]) -> list[list[int]]:
+    """Places of similar sizes together."""
+    class_of = np.ceil(np.log2(np.maximum(sizes, 1)))
+    return [np.flatnonzero(class_of == one).tolist() for one in np.unique(class_of)]
+
+
+def filled(sets: Sequence[Ints]) -> tuple[Ints, Bools]:
+    """Members of sets, filled up to the same number, and where they are members, (k, n) each."""
+    members = np.zeros((len(sets), max(each.size for each in sets)), dtype=np.intp)
+    inside = np.zeros(members.shape, dtype=np.bool_)
+    for k, each in enumerate(sets):
+        members[k, : each.size], inside[k, : each.size] = each, True
+    return members, inside
