@@ -381,7 +381,7 @@ def _transient(design: SequentialDesign, state: SequentialState, given: Floats, 
     change = _unseen(design, state, given)
     unknown = np.minimum((1.0 - decay) / (rate * droop.tau) * change, 2.0 * droop.limit)
     effect = np.abs(design.sensitivities.columns(Power.REACTIVE, droop.customer)[design.prior.meters])
-    return np.minimum(left + effect @ unknown, design.inverter_reach)
+    return np.asarray(np.minimum(left + effect @ unknown, design.inverter_reach))
 
 
 def _unseen(design: SequentialDesign, state: SequentialState, given: Floats) -> Floats:
