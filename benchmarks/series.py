@@ -23,7 +23,7 @@ import numpy as np
 from gridsec.interface import Cause, Decision
 from service.report.report import FeederReport, MeterState
 from service.store import Store
-from service.store.series import pack, rows
+from service.store.series import pack
 from tests.service.conftest import Server, SmallService, Village
 
 BEGIN, DAYS, METERS, STEP_S, DISTINCT = 1_795_200_000.0, 14, 146, 10.0, 500
@@ -48,7 +48,7 @@ def filled(path: Path) -> float:
     """Write the history; return the time of one commit that adds roll-ups, s."""
     draw = np.random.default_rng(1)
     made = [a_report(BEGIN + 7.0 * k, draw) for k in range(DISTINCT)]
-    packed = [pack(rows(one)) for one in made]
+    packed = [pack(one.row) for one in made]
     count = int(DAYS * 86_400 / STEP_S)
     with Store(f"sqlite:///{path}") as store:
         store.commit(reports=[replace(made[0], t=BEGIN)])

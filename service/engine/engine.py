@@ -523,7 +523,8 @@ class Engine:
         for result in results:
             monitor = self.monitors[result.state.feeder]
             reports = self._guarded(monitor, partial(self._history, result.state)) or ()
-            self.committer.waiting.add(transitions=result.transitions, reports=reports)
+            if result.transitions or reports:
+                self.committer.waiting.add(transitions=result.transitions, reports=reports)
             self.metrics.count_tick(result.state, len(monitor.book.active))
             self.reported[monitor.name] = time.monotonic()
             self.keep_states((monitor,))
@@ -672,7 +673,8 @@ class Engine:
         for monitor in self.monitors.values() if monitors is None else monitors:
             kept, happened = monitor.commissioning.due(at_once=at_once)
             kept = (*kept, *monitor.suspicions.due(), *monitor.observer.due(at_once=at_once))
-            self.committer.waiting.add(kept=kept, happened=happened)
+            if kept or happened:
+                self.committer.waiting.add(kept=kept, happened=happened)
             for one in happened:
                 _say(one)
             if happened:

@@ -300,7 +300,7 @@ def plausible(known: Known, source: Ints, values: Floats, given: Bools) -> Bools
     """
     inside = (values >= known.lowest.take(source, axis=1)) & (values <= known.highest.take(source, axis=1))
     inside[P_KW:] |= ~given[P_KW:]
-    return np.logical_and.reduce(inside, axis=0)
+    return np.asarray(inside.all(axis=0))
 
 
 def _of_raws(

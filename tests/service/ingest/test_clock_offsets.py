@@ -13,7 +13,8 @@ from gridsec.interface import Cause
 from service.alarms.conditions import AlarmKind, Condition, Severity, conditions
 from service.alarms.state_machine import AlarmBook, AlarmRules, advance, restore
 from service.engine.feeder_monitor import FeederMonitor, align_rules, design
-from service.ingest.align import FEWEST, KEPT, OFFSETS_TICKS, Aligner, Clock, ClockOffsets, Tick, rules
+from service.ingest.align import OFFSETS_TICKS, Aligner, Clock, Tick, rules
+from service.ingest.clock_offsets import FEWEST, KEPT, ClockOffsets
 from service.ingest.reading import Reading
 from service.report.report import snapshot, to_json
 from tests.service.played import ingest

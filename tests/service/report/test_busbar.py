@@ -28,7 +28,7 @@ from service.engine.feeder_monitor import FeederMonitor, align_rules, design
 from service.ingest.align import Clock, Tick
 from service.ingest.reading import Reading
 from service.report.report import BUSBAR, BusbarMeterState, FeederReport, blind, build, busbar_report, to_json
-from service.store.series import pack, rows, unpack
+from service.store.series import pack, unpack
 from service.store.state_codec import KeptInvalid, decode_distrust, encode_distrust
 from tests.codes import refused
 from tests.service.commands import command, plain
@@ -205,8 +205,8 @@ def test_its_alarm_is_known_only_if_decided_judged_and_seen() -> None:
 def test_history_has_it_among_suspects_and_not_among_the_meters() -> None:
     liar = BusbarMeterState(True, True, True, (), None, 999.0, 999.0, 7.0)
     now = replace(report(meter("m1"), meter("m2", seen=False)), busbar=liar)
-    names = [one.meter for one in rows(now)]
-    found = unpack(pack(rows(now)), names, BUSBAR)
+    names = now.row.meters
+    found = unpack(pack(now.row), names, BUSBAR)
     assert (found["seen"], found["suspects"], found["v_volt_highest"]) == (1, [BUSBAR], 230.0)
     assert (found["meter"]["v_volt_reported"], found["meter"]["score"]) == (999.0, None)
 

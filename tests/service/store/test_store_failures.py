@@ -20,7 +20,7 @@ from service.alarms.state_machine import AlarmState, acknowledged
 from service.report.report import FeederReport
 from service.store import Store, StoreUnavailable, WriterLost, connect, schema
 from service.store.schema import CommissioningChange, CommissioningEvent
-from service.store.series import pack, rows
+from service.store.series import pack
 from service.store.state_codec import SnapshotKind, StateSnapshot
 from tests.codes import refused
 from tests.service.databases import Cluster, both
@@ -289,10 +289,10 @@ def test_a_database_whose_layouts_had_a_length_is_brought_forward(url: str) -> N
     with Store(url) as old, old._write() as connection:
         put_back(connection, 3, schema.WRITER)
         for number, each in enumerate(reports, 1):
-            meters = json.dumps([one.meter for one in rows(each)])
+            meters = json.dumps(each.row.meters)
             connection.execute(OLD_LAYOUT.insert().values(meters=meters))
             row = {"feeder": "village", "t": each.t, "verdict": "clean", "cause": "agreement"}
-            connection.execute(schema.HISTORY.insert().values(**row, layout=number, data=pack(rows(each))))
+            connection.execute(schema.HISTORY.insert().values(**row, layout=number, data=pack(each.row)))
     with Store(url) as new:
         new.commit(reports=[replace(each, t=each.t + 6000) for each in reports])
         new.commit([raised(an_alarm())], reports=[of_random_ids(T0 + 9000, 400)])

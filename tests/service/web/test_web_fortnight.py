@@ -14,7 +14,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from service.store import Store
-from service.store.series import pack, rows
+from service.store.series import pack
 from tests.service.looking import DESKTOP, PHONE, Site
 
 pytestmark = pytest.mark.browser
@@ -31,7 +31,7 @@ RESPONSE_S = 10.0
 def fill(path: Path, village: Any, step_s: float) -> None:
     """Store 14 days with a row every `step_s`; H3 is manipulated on one of them."""
     calm, attacked = (village.report(BEGIN, lies=lies) for lies in ({}, {"H3": 9.0}))
-    packed = [pack(rows(one)) for one in (calm, attacked)]
+    packed = [pack(one.row) for one in (calm, attacked)]
     with Store(f"sqlite:///{path}") as store:
         store.commit(reports=[calm])
     with closing(sqlite3.connect(path)) as connection, connection:
