@@ -336,7 +336,7 @@ class Support:
         self.rows = signatures.follow(
             self.made, self.rows, update, self.more, 1.0, begun=[0] if onset else []
         )
-        plain = estimate.honest(made, kernel.estimator, self.state, self.more, update)
+        plain = estimate.honest(made, kernel.estimator, self.state, self.more)
         if not self.rows.used[0]:
             return plain
         W = made.U.T[:, self.liars]

@@ -10,7 +10,6 @@ the tree.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from math import prod
 
 import numpy as np
 
@@ -23,9 +22,7 @@ from gridsec.grid.network import (
     Walk,
     at_ends,
     base_problems,
-    below,
     duplicates,
-    from_root,
     shrinking,
     walk,
 )
@@ -53,7 +50,7 @@ class Feeder(Balanced):
     half: Floats = field(init=False, repr=False)  # (b + 1,) shunt susceptance at the buses, pu
     charges: bool = field(init=False, repr=False)  # True if any bus has charging
     squared: Floats = field(init=False, repr=False)  # (b,) ``r^2 + x^2``, pu
-    alone: bool = field(init=False, repr=False)  # True if no two customers share a bus
+    sweep: _Sweep = field(init=False, repr=False)  # the feeder in the order of the walk
 
     def __post_init__(self) -> None:
         put(self, r=frozen(self.r), x=frozen(self.x), charging=frozen(self.charging))
@@ -63,7 +60,7 @@ class Feeder(Balanced):
             raise FeederInvalid(problems)
         half = at_ends(self.parent, self.charging)
         put(self, walk=walk(self.parent), half=half, charges=any_of(half), squared=self.r**2 + self.x**2)
-        put(self, alone=np.unique(self.bus).size == self.bus.size)
+        put(self, sweep=_sweep(self))
 
     def linear(self) -> LinDistFlow:
         """Matrices of the linear power flow of a feeder.
@@ -85,7 +82,7 @@ class Feeder(Balanced):
         p, q, v0_squared, steps: as in `loss_correction`; `steps` = 0 gives LinDistFlow.
         """
         flows = _linear_flows(self, p, q, v0_squared)
-        return _lossy(self, flows, flows, steps).v2
+        return _lossy(self, flows, flows, steps).v2.take(self.walk.start, axis=-1)
 
     def loss_correction(self, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1) -> Floats:
         """Correction of the linear squared voltage of every bus for branch losses and charging.
@@ -110,7 +107,7 @@ class Feeder(Balanced):
         if steps < 1:
             raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
         flows = _linear_flows(self, p, q, v0_squared)
-        return np.asarray(_lossy(self, flows, flows, steps).v2 - flows.v2)
+        return (_lossy(self, flows, flows, steps).v2 - flows.v2).take(self.walk.start, axis=-1)
 
     def corrected(
         self, p: Floats, q: Floats, v0_squared: Floats | float, *, steps: int = 1
@@ -125,7 +122,8 @@ class Feeder(Balanced):
             raise InputInvalid([Problem("out-of-range", f"steps is {steps}; it must be at least 1")])
         flows = _linear_flows(self, p, q, v0_squared)
         once = _lossy(self, flows, flows, 1)
-        return np.asarray(_lossy(self, flows, once, steps - 1).v2 - flows.v2), _remainder(self, flows, once)
+        correction = _lossy(self, flows, once, steps - 1).v2 - flows.v2
+        return correction.take(self.walk.start, axis=-1), _remainder(self, flows, once)
 
     def model_error_bound(self, p: Floats, q: Floats, v0_squared: Floats | float) -> Floats:
         """Bound of the error of `v^2` after one loss correction against the AC power flow.
@@ -147,10 +145,8 @@ class Feeder(Balanced):
         p, q (…, N): sizes of the customers' active and reactive powers, not negative, pu.
         Returns (…, b + 1): change at every bus, pu.
         """
-        both = np.empty((2, *np.broadcast(p, q).shape))
-        both[0], both[1] = p, q
-        P, Q = below(self.walk, _at_buses(self, both))[..., 1:]
-        return from_root(self.walk, 2.0 * (np.abs(self.r) * P + np.abs(self.x) * Q))
+        drop = -2.0 * _drop(self.sweep, _flows(self.sweep, p, q))
+        return _along_paths(self.sweep, drop).take(self.walk.start, axis=-1)
 
     def with_customers_at(self, places: Ints) -> Feeder:
         """See `Network`."""
@@ -324,77 +320,135 @@ def path_sums(feeder: Feeder, branch: Floats) -> Floats:
     return np.array(out)
 
 
-def _lossy(feeder: Feeder, flows: _Flows, now: _Flows, steps: int) -> _Flows:
-    """The linear power flow with the losses of the flows `now`, repeated `steps` times."""
-    for _ in range(steps):
-        current = (now.P * now.P + now.charged * now.charged) / now.v2[..., 1:]
-        charge = feeder.half * now.v2 if feeder.charges else now.v2
-        loss_p, loss_q, drop = _losses(feeder, current, charge, sign=-1.0)
-        # The losses include charging.
-        Q = flows.Q + loss_q
-        now = _Flows(flows.P + loss_p, Q, Q, flows.v2 - from_root(feeder.walk, drop))
-    return now
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sweep:
+    """The feeder in the depth-first order of its walk: subtrees are intervals. N customers, b + 1 buses.
+
+    Arrays of branches have an entry for the root, which is 0.
+    """
+
+    z: Floats  # (2, b + 1) r and x
+    squared: Floats  # (b + 1,)
+    half: Floats  # (b + 1,)
+    order: Ints  # (N + 1,) a leading zero, then the customers in this order
+    # first, last (b + 1,): the customers below each branch are those numbered from `first` to `last` - 1
+    first: Ints
+    last: Ints
+    end: Ints  # (b + 1,) the last bus below each branch
+    # steps, sign (2 b + 2,): branch of each step of the walk around the tree, -1 where the walk leaves it
+    steps: Ints
+    sign: Floats
+    enter: Ints  # (b + 1,) step that enters each branch
+    at: Ints  # (N,) number of each customer's bus
 
 
-def _remainder(feeder: Feeder, flows: _Flows, once: _Flows) -> Floats:
-    with np.errstate(all="ignore"):
-        # Increments of the first and of the second step.
-        current, charge = np.empty((2, *flows.v2[..., 1:].shape)), np.empty((2, *flows.v2.shape))
-        np.divide(flows.P**2 + flows.charged**2, flows.v2[..., 1:], out=current[0])
-        np.subtract((once.P**2 + once.Q**2) / once.v2[..., 1:], current[0], out=current[1])
-        charge[0], charge[1] = flows.v2, once.v2 - flows.v2
-        drop = _losses(feeder, np.abs(current), np.abs(feeder.half * charge), sign=1.0)[2]
-        first, second = from_root(feeder.walk, drop)
-        shrinks = shrinking(first, second, (-1,))
-        shrinks &= np.all((flows.v2 > 0) & (once.v2 > 0), axis=-1, keepdims=True)
-        bound = np.where(shrinks, 2.0 * second, np.inf)
-    return np.asarray(bound[..., feeder.bus])
+def _sweep(feeder: Feeder) -> _Sweep:
+    tree, count = feeder.walk, len(feeder.buses)
+    at, branch, number = tree.start[feeder.bus], tree.order[1:] - 1, np.arange(count)
+    start, stop, enter, leave = (of[tree.order] for of in (tree.start, tree.stop, tree.enter, tree.leave))
+    order = np.argsort(at, kind="stable")
+    first, last = (np.searchsorted(at[order], end) for end in (start, stop))
+    steps, sign = np.empty(2 * count, dtype=np.intp), np.ones(2 * count)
+    steps[enter], steps[leave], sign[leave] = number, number, -1.0
+    z, squared = np.zeros((2, count)), np.zeros(count)
+    z[:, 1:], squared[1:] = (feeder.r[branch], feeder.x[branch]), feeder.squared[branch]
+    order = np.concatenate([[0], order + 1])
+    first, last, end, steps, enter, at = map(frozen_ints, (first, last, stop - 1, steps, enter, at))
+    half = frozen(feeder.half[tree.order])
+    return _Sweep(
+        frozen(z), frozen(squared), half, frozen_ints(order), first, last, end, steps, frozen(sign), enter, at
+    )
+
+
+def _flows(sweep: _Sweep, p: Floats, q: Floats) -> Floats:
+    """Flows into each branch without losses, minus the injections (…, N) below it, (…, 2, b + 1)."""
+    both = np.zeros((*np.broadcast(p, q).shape[:-1], 2, sweep.order.size))
+    both[..., 0, 1:], both[..., 1, 1:] = p, q
+    total = both.take(sweep.order, axis=-1).cumsum(axis=-1)
+    out = total.take(sweep.first, axis=-1)
+    out -= total.take(sweep.last, axis=-1)
+    return out
+
+
+def _drop(sweep: _Sweep, flows: Floats) -> Floats:
+    """``r P + x Q`` of flows (…, 2, b + 1)."""
+    return np.asarray(np.einsum("...kb,kb->...b", flows, sweep.z))
+
+
+def _along_paths(sweep: _Sweep, values: Floats) -> Floats:
+    """Sums of branch values (…, b + 1) over the path from the root to each bus, (…, b + 1)."""
+    walked = values.take(sweep.steps, axis=-1)
+    walked *= sweep.sign
+    return walked.cumsum(axis=-1).take(sweep.enter, axis=-1)
+
+
+def _farther(sweep: _Sweep, values: Floats) -> Floats:
+    """Sums of values (…, b + 1) below each branch, without its own, (…, b + 1)."""
+    total = values.cumsum(axis=-1)
+    out = total.take(sweep.end, axis=-1)
+    out -= total
+    return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Flows:
-    """Linear power flow.
+    """Power flow in the order of the sweep, (…, b + 1) each with an entry for the root."""
 
-    P, Q: flows at the end of the branches, (…, b). charged: Q less the supply from charging below.
-    v2: squared voltages (…, b + 1).
-    """
-
-    P: Floats
-    Q: Floats
-    charged: Floats
-    v2: Floats
+    flows: Floats  # (…, 2, b + 1) P and Q at the end of the branches
+    charged: Floats  # Q less the supply from charging below
+    v2: Floats  # squared voltages
 
 
 def _linear_flows(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | float) -> _Flows:
     """Linear power flow from the injections of the customers."""
-    both = np.empty((2, *np.broadcast(p, q).shape))
-    both[0], both[1] = p, q
-    P, Q = -below(feeder.walk, _at_buses(feeder, both))[..., 1:]
+    sweep = feeder.sweep
+    flows = _flows(sweep, p, q)
     base = np.asarray(v0_squared, dtype=np.float64)[..., None]
-    v2 = base + from_root(feeder.walk, -2.0 * (feeder.r * P + feeder.x * Q))
-    charged = Q - below(feeder.walk, feeder.half * v2)[..., 1:] if feeder.charges else Q
-    return _Flows(P, Q, charged, v2)
-
-
-def _losses(feeder: Feeder, current: Floats, charge: Floats, *, sign: float) -> tuple[Floats, Floats, Floats]:
-    """Contributions of squared currents (…, b) and charging (…, b + 1) to P, Q and to the drop of v^2."""
-    own = np.zeros((2, *current.shape[:-1], current.shape[-1] + 1))
-    np.multiply(feeder.r, current, out=own[0, ..., 1:])
-    np.multiply(feeder.x, current, out=own[1, ..., 1:])
-    loss_p, loss_q = (below(feeder.walk, own) - own)[..., 1:]
+    v2 = base + _along_paths(sweep, -2.0 * _drop(sweep, flows))
+    charged = flows[..., 1, :]
     if feeder.charges:
-        loss_q = loss_q + sign * below(feeder.walk, charge)[..., 1:]
-    drop = 2.0 * (feeder.r * loss_p + feeder.x * loss_q) + feeder.squared * current
-    return loss_p, loss_q, drop
+        supply = sweep.half * v2
+        charged = charged - _farther(sweep, supply)
+        charged -= supply
+    return _Flows(flows, charged, v2)
 
 
-def _at_buses(feeder: Feeder, values: Floats) -> Floats:
-    """Sum of the customers' `values` (…, N) at every bus, (…, b + 1)."""
-    shape = (*values.shape[:-1], len(feeder.buses))
-    if feeder.alone:
-        out = np.zeros(shape)
-        out[..., feeder.bus] = values
-        return out
-    first = np.arange(0, prod(shape), shape[-1])[:, None]
-    total = np.bincount((first + feeder.bus).ravel(), weights=values.ravel(), minlength=prod(shape))
-    return np.asarray(total.reshape(shape))
+def _lossy(feeder: Feeder, flows: _Flows, now: _Flows, steps: int) -> _Flows:
+    """The linear power flow with the losses of the flows `now`, repeated `steps` times."""
+    sweep = feeder.sweep
+    for _ in range(steps):
+        P = now.flows[..., 0, :]
+        current = (P * P + now.charged * now.charged) / now.v2
+        lost = _farther(sweep, sweep.z * current[..., None, :])
+        if feeder.charges:
+            if now is flows:
+                lost[..., 1, :] += now.charged - now.flows[..., 1, :]
+            else:
+                supply = sweep.half * now.v2
+                lost[..., 1, :] -= _farther(sweep, supply) + supply
+        drop = 2.0 * _drop(sweep, lost)
+        drop += sweep.squared * current
+        lost += flows.flows
+        # The losses include charging.
+        now = _Flows(lost, lost[..., 1, :], flows.v2 - _along_paths(sweep, drop))
+    return now
+
+
+def _remainder(feeder: Feeder, flows: _Flows, once: _Flows) -> Floats:
+    sweep = feeder.sweep
+    with np.errstate(all="ignore"):
+        # Increments of the first and of the second step.
+        current, charge = np.empty((2, *flows.v2.shape)), np.empty((2, *flows.v2.shape))
+        np.divide(flows.flows[..., 0, :] ** 2 + flows.charged**2, flows.v2, out=current[0])
+        np.subtract((once.flows**2).sum(axis=-2) / once.v2, current[0], out=current[1])
+        np.abs(current, out=current)
+        lost = _farther(sweep, sweep.z * current[..., None, :])
+        if feeder.charges:
+            charge[0], charge[1] = flows.v2, once.v2 - flows.v2
+            supply = np.abs(sweep.half * charge)
+            lost[..., 1, :] += _farther(sweep, supply) + supply
+        first, second = _along_paths(sweep, 2.0 * _drop(sweep, lost) + sweep.squared * current)
+        shrinks = shrinking(first, second, (-1,))
+        shrinks &= np.all((flows.v2 > 0) & (once.v2 > 0), axis=-1, keepdims=True)
+        bound = np.where(shrinks, 2.0 * second, np.inf)
+    return bound.take(sweep.at, axis=-1)

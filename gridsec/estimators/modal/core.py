@@ -21,7 +21,7 @@ from math import inf, log
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, any_of, indices
 from gridsec.errors import InputInvalid, Problem
 from gridsec.estimators.modal import detector, full, masking, mirrors, replay, rivals, signatures, static
 from gridsec.estimators.modal import estimate as estimates
@@ -270,16 +270,16 @@ def step(  # noqa: PLR0917  # the state, and one tick
         If t is before the last reading or not a number.
     """
     made, h, masked, read = core.modes, t - state.filter.t, state.masked, seen
-    if masked.meters.any():
+    if any_of(masked.meters):
         seen = ~masked.meters if read is None else read & ~masked.meters
-    pinned = np.flatnonzero(state.detector.pinned).tolist()
+    pinned = indices(state.detector.pinned).tolist()
     after, known, update = full.step(
         made, state.filter, state.static, t, m, seen, stay=bool(pinned), unknown=unknown
     )
     test, evidence = detector.step(
         made, core.faults, state.detector, update, known, h=h, alert=CALM * core.limit
     )
-    if masked.meters.any() and after.full is not None:
+    if any_of(masked.meters) and after.full is not None:
         masked = masking.follow(made, masked, after.full, m, read)
     suspected = state.suspected
     if update.exact is not None:
@@ -562,13 +562,15 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     if state.update is None:
         raise InputInvalid([Problem("missing", "no reading is available yet")])
     made, by = core.modes, core.estimator
-    plain = estimates.honest(made, by, state.filter, state.static, state.update)
+    plain = estimates.honest(made, by, state.filter, state.static)
     if suspicion is None:
         return plain
-    found, before, T = suspicion.found, [plain], list[Floats]()
-    for each in state.rivals[1:]:
-        update = each.update or state.update
-        before.append(estimates.honest(each.modes, by, each.filter, each.static, update, loads=each.loads))
+    found, T = suspicion.found, list[Floats]()
+    others = (
+        estimates.honest(each.modes, by, each.filter, each.static, loads=each.loads)
+        for each in state.rivals[1:]
+    )
+    before = [plain, *others]
     for model, filtered in enumerate((state.filter, *(each.filter for each in state.rivals[1:]))):
         used, moved = found.chosen[found.model == model].any(axis=0), np.zeros_like(core.effect)
         if used.any():

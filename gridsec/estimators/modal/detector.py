@@ -45,7 +45,7 @@ from math import inf, log, sqrt
 import numpy as np
 from scipy.linalg import lapack
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices
 from gridsec.estimators.modal import signatures
 from gridsec.estimators.modal.filter import Update
 from gridsec.estimators.modal.model import Modes
@@ -97,6 +97,8 @@ class Detector:
         Rows that are evaluated at every tick and not dropped.
     log_m
         log M when it was evaluated last.
+    precision
+        Precision of the last innovation at each member; None before the first tick.
     """
 
     onsets: Onsets
@@ -105,6 +107,47 @@ class Detector:
     ratio: Floats | None
     pinned: Bools
     log_m: float
+    precision: Precision | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Precision:
+    """Lower bound of the diagonal of ``V^-1`` at the members. t modes.
+
+    Attributes
+    ----------
+    variance : (t,)
+        v of the modes for which the bound is exact. It holds for all smaller ones.
+    least : (t,)
+        The bound.
+    """
+
+    variance: Floats
+    least: Floats
+
+    def exact(self, modes: Modes, update: Update, which: Bools | None = None) -> Floats:
+        """The diagonal itself at a tick, for some members (t,) or for all."""
+        which = np.ones(modes.size, dtype=np.bool_) if which is None else which
+        if update.exact is not None:
+            return update.exact.precision[which]
+        return np.asarray(modes.squares[which] @ (1.0 / update.variance))
+
+
+def precision(modes: Modes, before: Precision | None, update: Update) -> Precision:
+    """Bound of a tick: that of an earlier one while the variances of the modes fall.
+
+    Parameters
+    ----------
+    modes, before
+        The modes, and the earlier bound.
+    update
+        The filter's step.
+    """
+    if update.exact is not None:
+        return Precision(np.zeros(modes.size), update.exact.precision)
+    if before is not None and all_of(update.variance <= before.variance):
+        return before
+    return Precision(update.variance, modes.squares @ (1.0 / update.variance))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,7 +211,8 @@ def step(
     """Take in one step of the filter and evaluate M, if that is due.
 
     All onsets are evaluated at every `EVERY`-th tick. Young and pinned ones are evaluated at every tick while
-    an onset is pinned, while log M was above `alert`, and where one innovation stands out by itself. Powers
+    an onset is pinned, while log M was above `alert`, where a reading is missing, and where one innovation
+    stands out by itself. Powers
     are evaluated at every `EVERY`-th tick and while an onset is pinned: an alarm by them alone lasts. The
     choice may depend on the readings: what is left out only makes M smaller.
 
@@ -194,44 +238,44 @@ def step(
         begun.append(_STEPS + int(free[_STEPS:].argmin()))
         capital[:, begun[1]] = log(RAMPS * RAMP_EVERY)
     onsets = signatures.follow(modes, before.onsets, update, static, h, begun=begun, ended=ended)
-    full, none, suspected = ticks % EVERY == 0, np.full(capital.shape, -inf), bool(before.pinned.any())
-    if not (full or before.log_m >= alert or suspected or _stands_out(modes, update, static)):
-        return Detector(onsets, capital, ticks, None, before.pinned, before.log_m), Evidence(-inf, none)
+    full, suspected = ticks % EVERY == 0, any_of(before.pinned)
+    least = precision(modes, before.precision, update)
+    always = full or suspected or update.seen is not None or before.log_m >= alert
+    if not (always or _stands_out(modes, update, static, least)):
+        return Detector(onsets, capital, ticks, None, before.pinned, before.log_m, least), _NO_EVIDENCE
     young = (onsets.age <= YOUNG) & ~onsets.ramp
     due = onsets.used if full else onsets.used & (young | before.pinned)
-    rows = np.flatnonzero(due)
-    ratio = none
+    rows, ratio = indices(due), np.full(capital.shape, -inf)
     now = signatures.scores(modes, onsets, static, rows)
     ratio[:, rows] = log_ratios(columns, modes, now, full or suspected)
     by_row = capital + _LOG_WEIGHTS + ratio
-    if due[_STEPS:].any():
+    if any_of(due[_STEPS:]):
         # A ramp has its capital at the last tick of those that it stands for.
         by_row[:, onsets.ramp & (onsets.age < RAMP_EVERY)] = -inf
     top = float(by_row.max())
     log_m = top + log(float(np.exp(by_row - top).sum()))
-    test = Detector(onsets, capital, ticks, ratio if full else None, before.pinned, log_m)
+    test = Detector(onsets, capital, ticks, ratio if full else None, before.pinned, log_m, least)
     return test, Evidence(log_m, by_row)
 
 
-def _stands_out(modes: Modes, update: Update, static: Static) -> bool:
-    """A member, a phase of the busbar, or all of them together, stand out in one innovation."""
-    score, v, W = static.score, update.variance, modes.phases
-    if update.exact is not None:
-        n, half, white = update.exact.rows, update.exact.half, update.exact.white
-        sigma, F, count, misfit = modes.U @ score, update.exact.precision, n.size, float(white @ white)
-        felt, _ = lapack.dtrtrs(half, W[n], lower=True) if n.size else (W[n], 0)
+def _stands_out(modes: Modes, update: Update, static: Static, least: Precision) -> bool:
+    """A member, a phase of the busbar, or all together, stand out in one innovation of all members."""
+    v, exact = update.variance, update.exact
+    if exact is not None:
+        sigma, misfit = exact.score, float(exact.white @ exact.white)
+        felt, _ = lapack.dtrtrs(exact.half, modes.phases, lower=True)
         of_busbar = (felt * felt).sum(axis=0)
     else:
-        sigma, F, count, misfit = (
-            modes.U @ score,
-            modes.squares @ (1.0 / v),
-            v.size,
-            float(score @ (v * score)),
-        )
-        of_busbar = ((modes.U.T @ W) ** 2).T @ (1.0 / v)
-    y = np.concatenate([sigma, sigma @ W])
-    F = np.concatenate([F, of_busbar])
-    return bool((y * y > JUMP * F).any() or misfit > count + sqrt(2.0 * JUMP * count))
+        sigma, misfit = modes.U @ static.score, float(static.score @ (v * static.score))
+        of_busbar = modes.phase_squares @ (1.0 / v)
+    if misfit > v.size + sqrt(2.0 * JUMP * v.size):
+        return True
+    y = sigma @ modes.phases
+    if any_of(y * y > JUMP * of_busbar):
+        return True
+    sigma = sigma * sigma
+    far = sigma > JUMP * least.least
+    return any_of(far) and any_of(sigma[far] > JUMP * least.exact(modes, update, far))
 
 
 def log_ratios(columns: Columns, modes: Modes, now: Scores, powers: bool) -> Floats:
@@ -348,6 +392,7 @@ def _thin(detector: Detector, capital: Floats, ratio: Floats) -> list[int]:
 
 
 _KINDS = np.arange(len(WEIGHTS))
+_NO_EVIDENCE = Evidence(-inf, np.full((len(WEIGHTS), _STEPS + RAMP_ROWS + 2), -inf))
 
 
 def _hand_over(capital: Floats, ratio: Floats, row: int, near: list[int]) -> None:

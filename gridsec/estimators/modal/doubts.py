@@ -28,7 +28,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from gridsec.arrays import Bools, Floats, any_of, indices
+from gridsec.arrays import Bools, Floats, all_of, any_of, indices
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.plant import usual
 from gridsec.estimators.sequential.design import SequentialDesign
@@ -88,17 +88,13 @@ def unknown(
     skew
         Changes of the voltages within clock offsets.
     """
-    frame, doubt = usual(measured.frame), design.doubt
-    p = _wider(frame.p_error, doubt.p, uncertainty.p[0])
-    q = _wider(frame.q_error, doubt.q, uncertainty.q[0])
-    power = np.concatenate([p, np.hypot(q, _unsettled(design, predicted, measured.uses_q))])
-    which = indices(power > 0.0)
-    columns = [design.sensitivities.numbered(which) * power[which]] if which.size else []
-    metered = np.atleast_1d(np.asarray(measured.busbar_metered))
+    columns = _powers(design, measured, uncertainty, predicted)
+    metered = np.asarray(measured.busbar_metered)
     places = design.prior.variance.size
-    for phase in np.flatnonzero(~metered).tolist():
-        at = np.arange(places) % metered.size == phase
-        columns.append(UNMETERED * at[:, None].astype(np.float64))
+    if not all_of(metered):
+        for phase in indices(~np.atleast_1d(metered)).tolist():
+            at = np.arange(places) % metered.size == phase
+            columns.append(UNMETERED * at[:, None].astype(np.float64))
     clocks = _clocks(design, measured, skew)
     if not columns and clocks is None:
         return None
@@ -110,18 +106,35 @@ def unknown(
     return Unknown(whole, meters, measured.available & ~uncertainty.vouched[0])
 
 
+def _powers(
+    design: SequentialDesign, measured: Measurements, uncertainty: FrameUncertainty, predicted: Prediction
+) -> list[Floats]:
+    """Directions of powers and injections, none or (n, k)."""
+    unsettled = _unsettled(design, predicted, measured.uses_q)
+    if uncertainty.usual and unsettled is None:
+        return []
+    frame, doubt = usual(measured.frame), design.doubt
+    p = _wider(frame.p_error, doubt.p, uncertainty.p[0])
+    q = _wider(frame.q_error, doubt.q, uncertainty.q[0])
+    power = np.concatenate([p, q if unsettled is None else np.hypot(q, unsettled)])
+    which = indices(power > 0.0)
+    return [design.sensitivities.numbered(which) * power[which]] if which.size else []
+
+
 def _wider(error: Floats, known: Floats, factor: Floats) -> Floats:
     """Standard deviations of the parts of powers' errors that the design does not contain, (N,), pu."""
     more = np.maximum(error * error / 3.0 - np.maximum(known, EXACT) ** 2, 0.0)
     return np.where(factor > 1.0, np.sqrt(more), 0.0)
 
 
-def _unsettled(design: SequentialDesign, predicted: Prediction, metered: Bools) -> Floats:
+def _unsettled(design: SequentialDesign, predicted: Prediction, metered: Bools) -> Floats | None:
     """Standard deviation of injections known far less well than the design supposes, (N,), pu."""
     droop, N = design.plant.droop, design.customers
-    error = droop.per_customer(predicted.injection_error.error, N) / np.sqrt(3.0)
+    error = droop.per_customer(predicted.injection_error.error, N)
+    error /= np.sqrt(3.0)
     usually = design.injections + droop.per_customer(design.mismatch, N)
-    return np.where((error > UNSETTLED * np.maximum(usually, EXACT)) & ~metered, error, 0.0)
+    out = error > UNSETTLED * np.maximum(usually, EXACT)
+    return np.where(out & ~metered, error, 0.0) if any_of(out) else None
 
 
 def _clocks(design: SequentialDesign, measured: Measurements, skew: ClockSkew | None) -> Floats | None:

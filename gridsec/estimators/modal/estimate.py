@@ -30,7 +30,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, indices, submatrix
 from gridsec.estimators.modal.costs import SearchProblem, amounts, mean_amounts
-from gridsec.estimators.modal.filter import FilterState, Full, Update
+from gridsec.estimators.modal.filter import FilterState, Full
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.search import Identification
 from gridsec.estimators.modal.signatures import Joint
@@ -38,6 +38,8 @@ from gridsec.estimators.modal.static import Static
 from gridsec.estimators.sequential.output import PENDING, BoundedEstimate, BoundInputs
 from gridsec.interface import Estimate
 
+ROUNDING = 1e-12
+"""Relative size of singular values that are rounding, 1."""
 COUNTED = 1e-5
 """Weight from which on an explanation counts in the estimate, 1: 100 deviations apart, it adds a tenth."""
 
@@ -50,6 +52,12 @@ class Estimator:
     ----------
     of_w, of_b, of_e : (n, t)
         Regression of the error of the model at each place on w, b and e.
+    of_modes : (n, t)
+        Covariance h of the loads at each place with the modes.
+    by_w, by_b : (t,)
+        ``of_w = h diag(by_w)``; ``of_b`` is ``h diag(by_b)`` but for a few directions.
+    left, right : (n, k), (k, 2 t)
+        Factors of the rest of ``(of_b, of_e)``: meters of their own and the busbar's phases.
     rest : (n,)
         Variance that no reading takes away, squared pu^2.
     rest_w : (n,)
@@ -59,6 +67,11 @@ class Estimator:
     of_w: Floats = field(repr=False)
     of_b: Floats = field(repr=False)
     of_e: Floats = field(repr=False)
+    of_modes: Floats = field(repr=False)
+    by_w: Floats = field(repr=False)
+    by_b: Floats = field(repr=False)
+    left: Floats = field(repr=False)
+    right: Floats = field(repr=False)
     rest: Floats
     rest_w: Floats
 
@@ -96,7 +109,8 @@ def estimator(modes: Modes) -> Estimator:
     S, H = model.of_meters[:, at], model.phases(at)
     known = modes.loads > 0.0
     h = S @ modes.U
-    ratio = h * np.where(known, 1.0 / np.where(known, modes.loads, 1.0), 0.0)
+    by_w = np.where(known, 1.0 / np.where(known, modes.loads, 1.0), 0.0)
+    ratio = h * by_w
     C = model.lasting * S + model.busbar * (model.busbar_of @ H.T)
     by_b = np.linalg.solve(model.static(at), C.T).T if C.any() else np.zeros_like(C)
     by_e = model.flicker * (model.busbar_of @ (H.T @ modes.U))
@@ -104,7 +118,28 @@ def estimator(modes: Modes) -> Estimator:
     rest_w = (1.0 - model.lasting) * (model.variance - (ratio * h).sum(axis=1))
     rest = rest_w + model.lasting * model.variance + model.busbar * phases - (by_b * C).sum(axis=1)
     rest += model.flicker * phases - (by_e * by_e).sum(axis=1)
-    return Estimator(ratio, by_b @ modes.back, by_e, np.maximum(rest, 0.0), np.maximum(rest_w, 0.0))
+    of_b, lasts = by_b @ modes.back, modes.lasting > 0.0
+    share = np.where(lasts, model.lasting / np.where(lasts, modes.lasting, 1.0), 0.0)
+    left, right = _factors(np.hstack([of_b - h * share, by_e]))
+    return Estimator(
+        of_w=ratio,
+        of_b=of_b,
+        of_e=by_e,
+        of_modes=np.ascontiguousarray(h),
+        by_w=by_w,
+        by_b=share,
+        left=left,
+        right=right,
+        rest=np.maximum(rest, 0.0),
+        rest_w=np.maximum(rest_w, 0.0),
+    )
+
+
+def _factors(matrix: Floats) -> tuple[Floats, Floats]:
+    """Factors (n, k) and (k, m) of a matrix of rank k, to rounding."""
+    left, size, right = np.linalg.svd(matrix, full_matrices=False)
+    k = int(np.count_nonzero(size > ROUNDING * size.max(initial=0.0)))
+    return np.ascontiguousarray(left[:, :k] * size[:k]), np.ascontiguousarray(right[:k])
 
 
 def honest(
@@ -112,32 +147,42 @@ def honest(
     made: Estimator,
     state: FilterState,
     static: Static,
-    update: Update,
     *,
     loads: float = 1.0,
 ) -> Estimated:
     """Estimate without a fault; O(n t).
 
+    The white errors e are the score of the innovation: their covariance is the identity.
+
     Parameters
     ----------
     modes, made
         The modes, and the estimator of them.
-    state, static, update
-        The filter after the last tick, the information about the directions, and the filter's last step.
+    state, static
+        The filter after the last tick, and the information about the directions.
     loads
         Variance of the loads' errors that vary, in those of the model, 1.
     """
     more = (loads - 1.0) * made.rest_w
     if state.full is not None:
         w, b = state.full.mean @ modes.U
-        mean = made.of_w @ w + made.of_b @ b + made.of_e @ static.score
+        mean = _mean(made, w, b, static.score)
         return Estimated(mean, partial(_full_variance, modes, made, state.full, more))
-    w, b, e = *state.mean, update.innovation / update.variance
+    w, b = state.mean
     if modes.sign.size:
         (g_w, g_b), known = static.signature, modes.directions @ static.theta
-        w, b, e = w - g_w * known, b + (1.0 - g_b) * known, e - (1.0 - g_w - g_b) * known
-    mean = made.of_w @ w + made.of_b @ b + made.of_e @ e
+        w, b = w - g_w * known, b + (1.0 - g_b) * known
+    mean = _mean(made, w, b, static.score)
     return Estimated(mean, partial(_variance, modes, made, state.cov, static, more))
+
+
+def _mean(made: Estimator, w: Floats, b: Floats, e: Floats) -> Floats:
+    """Regression of all places on w, b and e, (n,)."""
+    of_modes = made.by_w * w
+    of_modes += made.by_b * b
+    out = made.of_modes @ of_modes
+    out += made.left @ (made.right @ np.concatenate([b, e]))
+    return out
 
 
 def _variance(modes: Modes, made: Estimator, cov: Floats, static: Static, more: Floats) -> Floats:

@@ -123,6 +123,8 @@ class Innovation:
         ``L^-1 nu``.
     precision : (t,)
         Diagonal of ``V^-1``; 0 without a reading.
+    score : (n,)
+        ``V^-1 nu``.
     """
 
     rows: Ints
@@ -130,6 +132,7 @@ class Innovation:
     gain: Floats = field(repr=False)
     white: Floats = field(repr=False)
     precision: Floats = field(repr=False)
+    score: Floats = field(repr=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,14 +206,16 @@ def step(
     if not h >= 0.0:
         raise InputInvalid([Problem("order", f"t is {t}; it must not be before {state.t}")])
     rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
-    mean = state.mean * np.array([[rho], [rho_b]])
     cov, shared, v = predicted(modes, state.cov, rho, rho_b)
     whole = seen is None or all_of(seen)
-    gain, nu = shared / v, np.zeros(v.size)
+    gain, mean, nu = shared / v, state.mean, np.zeros(v.size)
     if state.full is None:
         if not whole:
             raise InputInvalid([Problem("missing", "missing readings need the full covariance")])
-        nu = m @ modes.U - mean[0] - mean[1]
+        mean = mean * np.array([[rho], [rho_b]])
+        nu = m @ modes.U
+        nu -= mean[0]
+        nu -= mean[1]
         mean += gain * nu
     cov[:2] -= gain * shared[0]
     cov[2] -= gain[1] * shared[1]

@@ -40,7 +40,7 @@ from math import exp
 import numpy as np
 from scipy.linalg import blas, lapack
 
-from gridsec.arrays import Bools, Floats, Ints, all_of, indices, submatrix
+from gridsec.arrays import Bools, Floats, Ints, all_of, changed, indices, submatrix
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal import static
 from gridsec.estimators.modal.filter import FilterState, Full, Innovation, Update
@@ -97,14 +97,11 @@ def step(  # noqa: PLR0917  # the states of both parts, and one tick
     after, update = modal.step(modes, state, t, m, seen)
     if state.full is not None:
         full, innovation = updated(modes, state.full, t - state.t, m, None if whole else seen, unknown)
-        score = np.zeros(modes.size)
-        if innovation.rows.size:
-            sigma, _ = lapack.dtrtrs(innovation.half, innovation.white, lower=True, trans=1)
-            score = sigma @ modes.back[innovation.rows]
+        score = innovation.score @ modes.back[innovation.rows]
         share, since = _share(modes, state.full, update)
         kept, slower = _kept(modes, full.kept, update, share)
-        after = replace(after, full=replace(full, kept=kept, share=share, since=since))
-        update = replace(update, slower=slower, exact=innovation, score=score)
+        after = changed(after, full=changed(full, kept=kept, share=share, since=since))
+        update = changed(update, slower=slower, exact=innovation, score=score)
     return after, static.follow(modes, known, update), update
 
 
@@ -164,13 +161,13 @@ def updated(  # noqa: PLR0917  # the filter, and one tick
     if not rows.size:
         none = np.zeros((2 * t, 0))
         return Full(mean, (w, both, b), np.zeros(t, dtype=np.bool_), before.kept, 0), Innovation(
-            rows, none[:0], none, none[0], np.zeros(t)
+            rows, none[:0], none, none[0], np.zeros(t), none[0]
         )
     complete, nu = before.complete + 1 if seen is None else 0, (m - mean[0] - mean[1])[rows]
     HP = np.empty((rows.size, 2 * t))
-    np.add(w[rows], both[:, rows].T, out=HP[:, :t])
-    np.add(both[rows], b[rows], out=HP[:, t:])
-    V = HP[:, rows] + HP[:, t + rows] + submatrix(modes.noise, rows, rows)
+    np.add(w.take(rows, axis=0), both.take(rows, axis=1).T, out=HP[:, :t])
+    np.add(both.take(rows, axis=0), b.take(rows, axis=0), out=HP[:, t:])
+    V = (HP[:, :t] + HP[:, t:]).take(rows, axis=1) + submatrix(modes.noise, rows, rows)
     if unknown is not None:
         V, complete = V + unknown[rows] @ unknown[rows].T, 0
     half, failed = lapack.dpotrf(V.T, lower=True, overwrite_a=True, clean=True)
@@ -178,6 +175,7 @@ def updated(  # noqa: PLR0917  # the filter, and one tick
         raise np.linalg.LinAlgError("the covariance of the innovation is not positive definite")
     gain = blas.dtrsm(1.0, half, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1)
     white, _ = lapack.dtrtrs(half, nu, lower=True)
+    score, _ = lapack.dtrtrs(half, white, lower=True, trans=1)
     mean += (gain @ white).reshape(2, t)
     of_w, of_b = gain[:t], gain[t:]
     w -= of_w @ of_w.T
@@ -188,7 +186,7 @@ def updated(  # noqa: PLR0917  # the filter, and one tick
     precision[rows] = (inverse * inverse).sum(axis=0)
     seen = np.ones(t, dtype=np.bool_) if seen is None else seen
     return Full(mean, (w, both, b), seen, before.kept, complete), Innovation(
-        rows, half, gain, white, precision
+        rows, half, gain, white, precision, score
     )
 
 

@@ -276,6 +276,27 @@ class Modes:
         H = self.model.phases(self.at)
         return H[:, H.any(axis=0)]
 
+    @cached_property
+    def phase_squares(self) -> Floats:
+        """Squares of the phases of the busbar in the modes, (b, t)."""
+        return np.asarray((self.phases_in_modes**2).T)
+
+    @cached_property
+    def phases_in_modes(self) -> Floats:
+        """Columns of the phases of the busbar in the modes, (t, b)."""
+        return self.U.T @ self.phases
+
+    @cached_property
+    def crossed(self) -> Floats:
+        """Products of the directions and the phases of the busbar in the modes, (t, r b)."""
+        W = self.phases_in_modes
+        return (self.directions[:, :, None] * W[:, None, :]).reshape(self.size, -1)
+
+    @cached_property
+    def noise_std(self) -> Floats:
+        """Standard deviation of the white errors of the members, (t,)."""
+        return np.asarray(np.sqrt(self.noise.diagonal()))
+
     @property
     def size(self) -> int:
         """Number of members and of modes, t."""

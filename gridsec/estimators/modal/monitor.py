@@ -270,19 +270,20 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
         v0_squared=measured.v0_squared,
     )
     open_ = doubts.unknown(front, measured, uncertainty, predicted, skew)
-    seen = measured.available
-    m = np.where(seen, measured.y - v2, 0.0)
-    kernel = _begun_anew(design, state, frame.t) if open_ is None and all_of(seen) else state.core
+    seen, whole, m = measured.available, all_of(measured.available), measured.y - v2
+    if not whole:
+        m = np.where(seen, m, 0.0)
+    kernel = _begun_anew(design, state, frame.t) if open_ is None and whole else state.core
     kernel, evidence = core.step(
         design.core,
         _repeating(kernel, repeat_lags(kinds) > 0),
         frame.t,
         m,
-        None if all_of(seen) else seen,
+        None if whole else seen,
         None if open_ is None else open_.wide,
     )
-    after, evidence = _identified(design, replace(state, front=now, core=kernel), evidence, measured.uses_q)
-    if not np.array_equal(after.front.busbar.trusted, now.busbar.trusted):
+    after, evidence = _identified(design, changed(state, front=now, core=kernel), evidence, measured.uses_q)
+    if after.front.busbar is not now.busbar:
         # A phase named at this tick is not metered any more.
         metered = np.asarray(measured.busbar_metered) & after.front.busbar.trusted
         measured = replace(measured, busbar_metered=metered if metered.size > 1 else bool(metered[0]))
@@ -308,11 +309,13 @@ def _driven(
     if kernel.update is None or not front.meter_of.size or given.x is None:
         return given, measured, predicted
     m = measured.y - predicted.v2_bus[front.prior.meters]
+    # The variance is at least that of the white errors.
+    far = np.abs(verdict.offsets(design.core, kernel, m)) > JUMP * design.core.modes.noise_std
+    if not any_of(far):
+        return given, measured, predicted
     drives = np.zeros(m.size, dtype=np.bool_)
     drives[front.meter_of[front.meter_of >= 0]] = True
     drives &= measured.available & given.trust.trusted
-    # The variance is at least that of the white errors.
-    far = np.abs(verdict.offsets(design.core, kernel, m)) > JUMP * np.sqrt(design.core.modes.noise.diagonal())
     if not any_of(drives & far):
         return given, measured, predicted
     off, std = verdict.deviations(design.core, kernel, m)
@@ -363,9 +366,7 @@ def _identified(
     if suspicion is not None and not pinned[suspicion.row]:
         suspicion = None
     if not any_of(pinned):
-        zero = 0 * state.streak, 0 * state.phases, 0 * state.inverters
-        none = replace(state, suspicion=None, streak=zero[0], phases=zero[1], inverters=zero[2], due=0)
-        return none, evidence
+        return _unsuspected(state), evidence
     if tick < state.due or not core.alarmed(kernel, evidence):
         return replace(state, suspicion=suspicion), evidence
     suspicion = core.identify(kernel, state.core, evidence)
@@ -394,6 +395,14 @@ def _identified(
         if adopted is not state.core:
             return replace(after, core=adopted, suspicion=None), evidence
     return after, evidence
+
+
+def _unsuspected(state: ModalState) -> ModalState:
+    """State without a suspicion and without the counts of searches."""
+    if state.suspicion is None and not state.due:
+        return state
+    zero = 0 * state.streak, 0 * state.phases, 0 * state.inverters
+    return replace(state, suspicion=None, streak=zero[0], phases=zero[1], inverters=zero[2], due=0)
 
 
 def _without_busbar(
@@ -449,14 +458,16 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
     named, seen = kernel.masked.meters, tick.measured.available
     suspected = any_of(kernel.detector.pinned)
     trust = _trust(design, now, named, state.suspicion)
-    estimate, spread = _estimate(design, replace(state, front=trust), tick)
+    estimate, spread = _estimate(design, state if trust is now else changed(state, front=trust), tick)
     busbar = _busbar(design, now, tick, estimate, spread)
     evidence = verdict.meter_evidence(
         design.core, kernel, tick.evidence, (tick.m, seen), front.options.widest, state.suspicion
     )
     rivals = verdict.explanations(front, design.core, state.suspicion, tick.measured.uses_q)
     checks = _checked_inverters(design, state, trust, tick)
-    inverters = ((state.inverters >= CONFIRM) & ~checks.consistent(front)) | checks.named(front)
+    inverters = state.inverters >= CONFIRM
+    if not checks.idle:
+        inverters = (inverters & ~checks.consistent(front)) | checks.named(front)
     given = verdict.Inputs(
         frame=tick.measured.frame,
         seen=seen,
@@ -475,11 +486,10 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
     kinds = _kinds(design, state, tick, estimate, named)
     finding = verdict.verdict(front, given, estimate)
     open_cases = checks.explanations(front, named)
-    answer = Verdict(
-        *verdict.with_open_cases(front, finding, open_cases),
+    answer = verdict.Answer.later(
+        verdict.with_open_cases(front, finding, open_cases),
         named,
-        evidence.score,
-        evidence.threshold,
+        evidence.amounts,
         _attack(design, state, tick, estimate, named),
         inverters=inverters,
         inverter_attack=_injected(design, state, checks, inverters),
@@ -509,7 +519,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         learning=learning,
         last=(estimate, answer),
     )
-    out = replace(state, front=after, kept=kept or state.kept)
+    out = changed(state, front=after, kept=kept or state.kept)
     return (out if learning is None else _learned(design, out)), estimate, answer
 
 
@@ -518,6 +528,8 @@ def _trust(
 ) -> SequentialState:
     """Front end that trusts all meters but those that are named or that a likely explanation accuses."""
     trust, out = now.trust, named
+    if suspicion is None and trust.clear and not any_of(named):
+        return now
     if suspicion is not None:
         out = named | verdict.accused(design.core, suspicion)
     if np.array_equal(trust.named, named) and np.array_equal(trust.trusted, ~out):
@@ -579,12 +591,18 @@ def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Esti
         more = doubts.estimated(kernel.modes, tick.unknown, u, read)
         mean, spread = mean + more[0], _Spread(errors, more[1])
     v2_bus, first = tick.predicted.v2_bus + mean, plant.feeder.busbar_places()
-    v2_bus[first] = np.where(measured.busbar_metered, measured.v0_squared, v2_bus[first])
+    metered = all_of(np.asarray(measured.busbar_metered))
+    v2_bus[first] = (
+        measured.v0_squared
+        if metered
+        else np.where(measured.busbar_metered, measured.v0_squared, v2_bus[first])
+    )
     # While the readings disagree and no search has settled it, no reading bounds a voltage.
     sure = now.trust.trusted & measured.available & (not any_of(state.core.detector.pinned))
+    powers = tick.predicted.powers
     inputs = BoundInputs(
         plant=plant,
-        powers=changed(tick.predicted.powers, trusted=now.trust.trusted),
+        powers=powers if powers.trusted is now.trust.trusted else changed(powers, trusted=now.trust.trusted),
         injected=tick.predicted.injection_error.error,
         model=tick.predicted.v2_bus[plant.feeder.bus],
         busbar=measured.busbar_metered,
@@ -593,7 +611,7 @@ def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Esti
         checked=_Checked(front, measured.frame),
         sigmas=front.sigmas[0],
     )
-    least = replace(spread, places=first, least=np.where(measured.busbar_metered, front.busbar**2, 0.0))
+    least = changed(spread, places=first, least=np.where(measured.busbar_metered, front.busbar**2, 0.0))
     return Reconstructed.later(inputs, measured.frame.t, v2_bus, least, tick.predicted.x), spread
 
 
@@ -675,6 +693,8 @@ def _checked_inverters(
 
 def _injected(design: ModalDesign, state: ModalState, checks: InverterChecks, inverters: Bools) -> Floats:
     """Injections of named inverters beyond their curves, as metered where they are, (m,), pu."""
+    if not any_of(inverters):
+        return np.zeros(inverters.size)
     metered = checks.amounts(design.front)
     found = verdict.inverter_amounts(design.front, design.core, state.suspicion)
     return np.where(inverters, np.where(metered != 0.0, metered, found), 0.0)

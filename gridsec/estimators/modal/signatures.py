@@ -173,8 +173,10 @@ def follow(
             used[row], level[row] = True, not onsets.ramp[row]
         for row in ended:
             used[row], level[row], age[row] = False, 0.0, 0
-    level = level + h / RAMP_S * (onsets.ramp & used)
-    g = onsets.signature * np.array([rho, rho_b])[:, None, None]
+    level = level + (h / RAMP_S) * (onsets.ramp & used)
+    g = np.empty_like(onsets.signature)
+    np.multiply(onsets.signature[0], rho, out=g[0])
+    np.multiply(onsets.signature[1], rho_b, out=g[1])
     gamma = level[:, None] - g[0]
     gamma -= g[1]
     weighed = gamma / update.variance
@@ -219,8 +221,9 @@ def _busbar(modes: Modes, onsets: Onsets, update: Update, static: Static, gamma:
     """
     if update.exact is None:
         return None
-    W, rows, G = modes.U.T @ modes.phases, update.exact.rows, modes.directions
-    turn, before = np.einsum("kt,tr,tb->krb", onsets.cross, G, W, optimize=True), onsets.busbar
+    W, rows, G = modes.phases_in_modes, update.exact.rows, modes.directions
+    shape = (len(gamma), modes.sign.size, W.shape[1])
+    turn, before = (onsets.cross @ modes.crossed).reshape(shape), onsets.busbar
     if before is None:
         # The first tick without the modes: what is known of theta is that before it.
         earlier = replace(static, information=static.information - static.gamma**2 / update.variance)
@@ -233,9 +236,11 @@ def _busbar(modes: Modes, onsets: Onsets, update: Update, static: Static, gamma:
         few = modes.sign.size <= FEW
         cov = static.cov if few else of_busbar(modes, static)
         x -= (static.gamma[:, None] * G[:, : len(cov)]) @ (cov @ turn[:, : len(cov)])
-    felt = np.einsum("nt,ktb->nkb", modes.back[rows], x, optimize=True).reshape(rows.size, -1)
-    white = blas.dtrsm(1.0, update.exact.half, felt, lower=1)
-    return np.asarray(before + (white * white).sum(axis=0).reshape(before.shape))
+    felt = x.transpose(0, 2, 1).reshape(-1, modes.size) @ modes.back[rows].T
+    # ``L^-1 felt'``, without a copy to another order.
+    white = blas.dtrsm(1.0, update.exact.half, felt.T, lower=1, overwrite_b=1)
+    white *= white
+    return np.asarray(before + white.sum(axis=0).reshape(before.shape))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -29,7 +29,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gridsec.arrays import Floats
+from gridsec.arrays import Floats, changed
 from gridsec.estimators.modal.filter import Update
 from gridsec.estimators.modal.model import Modes
 
@@ -100,13 +100,13 @@ def follow(modes: Modes, before: Static, update: Update) -> Static:
     """
     if not modes.sign.size:
         score = update.innovation / update.variance if update.score is None else update.score
-        return replace(before, score=score)
+        return changed(before, score=score)
     rho, rho_b = update.decay
     g = before.signature * np.array([[rho], [rho_b]])
     gamma = 1.0 - g[0] - g[1]
     g += update.gain * gamma
     information = before.information + gamma * gamma / update.variance
-    now = replace(before, information=information)
+    now = changed(before, information=information)
     if update.score is not None:
         # The innovation is exact without theta, which says only how a fault would have been learned.
         cov, turn = before.cov, np.zeros(modes.sign.size)

@@ -7,7 +7,8 @@ onset alone reaches the limit at
 
 y and F being its score and its information. The score shown is the amount ``|y| / F``, the threshold the
 amount at equality. The sum may reach the limit before any of its parts does. For a masked meter the score is
-the distance of its reading from the filter without it, the threshold that of the release.
+the distance of its reading from the filter without it, the threshold that of the release. Both are evaluated
+where they are asked for.
 
 **Decision.** ATTACKED: a meter is named, an inverter, or the busbar's meter. UNDECIDED: log M was beyond the
 limit since the suspected onset, and nothing is named; a metered reactive power leaves its curve; too few
@@ -16,38 +17,40 @@ meters; unread powers that leave a voltage too uncertain. CLEAN: none of these.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from math import log
+from math import inf, log
+from typing import Any
 
 import numpy as np
 from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, all_of, any_of, indices
 from gridsec.estimators.detection import DecisionInputs, decide
-from gridsec.estimators.modal import masking, signatures
+from gridsec.estimators.modal import detector, masking, signatures
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.costs import amounts
 from gridsec.estimators.modal.detector import SIZE, WEIGHTS, Evidence
 from gridsec.estimators.modal.search import DOUBT
+from gridsec.estimators.modal.signatures import Scores
 from gridsec.estimators.plant import NO_VOLTAGE
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.device_checks import probability
 from gridsec.estimators.sequential.measurements import largest_offset, unusable_offsets
 from gridsec.estimators.sequential.output import (
+    PENDING,
     busbar_deviation,
     clock_sentence,
     explanations_sentence,
     fault_sentence,
     unread_sentence,
 )
-from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame
+from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 
 LIKELY = 0.01
 """Weight from which on an explanation is reported, 1."""
 SHOWN = 20
 """Largest number of reported explanations."""
-LEAST_PRECISION = 1e-6
-"""Least precision of a reading, 1 / squared pu^2: below it nothing is known of a voltage."""
 LEAST_V2 = 1e-2
 """Least squared voltage that relates a standard deviation to the voltage, pu."""
 
@@ -60,18 +63,14 @@ class MeterEvidence:
 
     Attributes
     ----------
-    score, threshold : (p,)
-        As in `gridsec.interface.Verdict`.
     tested : (p,)
         Meters that a single reading would show within the widest threshold.
-    row
-        Row of the onset in the detector.
+    amounts
+        Score and threshold, (p,) each, as in `gridsec.interface.Verdict`, evaluated where asked for.
     """
 
-    score: Floats
-    threshold: Floats
     tested: Bools
-    row: int
+    amounts: Callable[[], tuple[Floats, Floats]] = field(repr=False)
 
 
 def meter_evidence(  # noqa: PLR0917  # the core, one tick, and one limit
@@ -95,34 +94,95 @@ def meter_evidence(  # noqa: PLR0917  # the core, one tick, and one limit
     suspicion
         The explanations, if there are any.
     """
-    made, test, (m, seen) = core.modes, state.detector, now
+    made, test, (m, seen), update = core.modes, state.detector, now, state.update
     row = _row(state, evidence, suspicion)
     one = signatures.scores(made, test.onsets, state.static, np.array([row]))
-    y, F = (each[0] for each in one.of(made.U.T, made.squares.T))
-    F = np.maximum(F, np.finfo(np.float64).tiny)
-    part = log(WEIGHTS[0] / made.size) + float(test.capital[0, row])
-    gain = 2.0 * (core.limit - part) + np.log1p(SIZE**2 * F)
-    least = np.sqrt(np.maximum(gain, 0.0) * (1.0 + SIZE**2 * F)) / (SIZE * F)
-    score, threshold = np.where(seen, np.abs(y) / F, np.nan), np.minimum(least, NO_VOLTAGE)
-    update = state.update
-    if update is not None and update.exact is not None:
-        precision = update.exact.precision
-    elif update is not None:
-        precision = made.squares @ (1.0 / update.variance)
-    else:
-        precision = np.zeros(made.size)
-    alone = np.sqrt(2.0 * core.limit / np.maximum(precision, LEAST_PRECISION))
-    tested, full = seen & (alone <= widest), state.filter.full
+    tested, enough = np.zeros_like(seen), 2.0 * core.limit / widest**2
+    if update is not None:
+        least = test.precision or detector.precision(made, None, update)
+        tested = seen & (least.least >= enough)
+        if np.count_nonzero(tested) < np.count_nonzero(seen):
+            tested = seen & (least.exact(made, update) >= enough)
     if update is not None and update.seen is not None:
         # A meter released at this tick was not read.
         tested = tested | (seen & ~update.seen)
-    if any_of(state.masked.meters) and full is not None:
-        out = state.masked.meters
-        off, std = deviations(core, state, m)
-        score = np.where(out & seen, np.abs(off), score)
-        threshold = np.where(out, masking.OUTLIER * std, threshold)
-        tested = tested | (out & seen)
-    return MeterEvidence(score, threshold, tested, row)
+    masked = None
+    if any_of(state.masked.meters) and state.filter.full is not None:
+        masked = (state.masked.meters, *deviations(core, state, m))
+        tested = tested | (state.masked.meters & seen)
+    return MeterEvidence(tested, _Amounts(core, one, float(test.capital[0, row]), seen, masked))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Amounts:
+    """Score and threshold of every meter at one onset."""
+
+    core: Core
+    one: Scores  # of the onset
+    capital: float  # its logarithm
+    seen: Bools  # (p,) meters with a reading
+    # masked meters, with the deviations of their readings from the filter and the standard deviations
+    masked: tuple[Bools, Floats, Floats] | None
+
+    def __call__(self) -> tuple[Floats, Floats]:
+        made = self.core.modes
+        y, F = (each[0] for each in self.one.of(made.U.T, made.squares.T))
+        F = np.maximum(F, _TINY)
+        part = log(WEIGHTS[0] / made.size) + self.capital
+        gain = 2.0 * (self.core.limit - part) + np.log1p(SIZE**2 * F)
+        least = np.sqrt(np.maximum(gain, 0.0) * (1.0 + SIZE**2 * F)) / (SIZE * F)
+        score, threshold = np.where(self.seen, np.abs(y) / F, np.nan), np.minimum(least, NO_VOLTAGE)
+        if self.masked is None:
+            return score, threshold
+        out, off, std = self.masked
+        return np.where(out & self.seen, np.abs(off), score), np.where(out, masking.OUTLIER * std, threshold)
+
+
+class Answer(Verdict):
+    """Verdict with score and threshold computed on first access."""
+
+    __slots__ = ("_amounts",)
+    _amounts: Callable[[], tuple[Floats, Floats]]
+
+    @classmethod
+    def later(
+        cls,
+        finding: Finding,
+        suspects: Bools,
+        amounts: Callable[[], tuple[Floats, Floats]],
+        attack: Floats,
+        **rest: Any,
+    ) -> Answer:
+        """Verdict with the function `amounts` of score and threshold, (p,) each; `rest` as in `Verdict`."""
+        made = cls(*finding, suspects, PENDING, PENDING, attack, **rest)
+        object.__setattr__(made, "_amounts", amounts)
+        return made
+
+    @property
+    def score(self) -> Floats:
+        """Residual of each meter, squared pu, (p,); NaN without a reading."""
+        return self._found("score")
+
+    @score.setter
+    def score(self, value: Floats) -> None:
+        Verdict.__dict__["score"].__set__(self, value)
+
+    @property
+    def threshold(self) -> Floats:
+        """Largest score of an honest meter, squared pu, (p,)."""
+        return self._found("threshold")
+
+    @threshold.setter
+    def threshold(self, value: Floats) -> None:
+        Verdict.__dict__["threshold"].__set__(self, value)
+
+    def _found(self, name: str) -> Floats:
+        slot = Verdict.__dict__[name]
+        if slot.__get__(self) is PENDING:
+            for each, value in zip(("score", "threshold"), self._amounts(), strict=True):
+                Verdict.__dict__[each].__set__(self, value)
+        found: Floats = slot.__get__(self)
+        return found
 
 
 def deviations(core: Core, state: CoreState, m: Floats) -> tuple[Floats, Floats]:
@@ -156,8 +216,12 @@ def offsets(core: Core, state: CoreState, m: Floats) -> Floats:
     full, made = state.filter.full, core.modes
     if full is not None:
         return np.asarray(m - full.mean[0] - full.mean[1])
-    mean = made.back @ state.filter.mean.sum(axis=0)
-    return np.asarray(m - mean - _spread(core, state) @ state.static.theta)
+    w, b = state.filter.mean
+    mean = w + b
+    if made.sign.size:
+        g_w, g_b = state.static.signature
+        mean += (1.0 - g_w - g_b) * (made.directions @ state.static.theta)
+    return np.asarray(m - made.back @ mean)
 
 
 def _spread(core: Core, state: CoreState) -> Floats:
@@ -171,9 +235,10 @@ def _row(state: CoreState, evidence: Evidence, suspicion: Suspicion | None) -> i
     onsets = state.detector.onsets
     if suspicion is not None and onsets.used[suspicion.row]:
         return suspicion.row
-    of_meters = np.where(onsets.used, evidence.by_row[0], -np.inf)
-    if np.isfinite(of_meters).any():
-        return int(of_meters.argmax())
+    if evidence.log_m > -inf:
+        of_meters = np.where(onsets.used, evidence.by_row[0], -inf)
+        if of_meters.max() > -inf:
+            return int(of_meters.argmax())
     return int(np.where(onsets.used & ~onsets.ramp, onsets.age, -1).argmax())
 
 

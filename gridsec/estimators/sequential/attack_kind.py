@@ -607,11 +607,12 @@ def record_readings(
 ) -> ReadingHistory:
     """History with the readings y (p,), squared pu, of one tick; `store` has to follow before the next."""
     tick = before.tick + 1
-    code = now = hashed = np.rint(np.sqrt(np.minimum(np.maximum(y, 0.0), _HIGHEST)) / limits.step).astype(
-        np.int32
-    )
+    steps = np.sqrt(np.minimum(np.maximum(y, 0.0), _HIGHEST))
+    steps /= limits.step
+    code = now = hashed = np.rint(steps, out=steps).astype(np.int32)
     same = code == before.code
-    run, longest = (before.run + same) * same, before.longest
+    run, longest = before.run + same, before.longest
+    run *= same
     if not all_of(available):
         run = np.where(available, run, before.run)
         # A silent tick has a code of its own in the hash.

@@ -23,7 +23,7 @@ docs/theory-sequential.md, sections 1 and 3.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from math import ceil
 
@@ -70,10 +70,11 @@ def _unchanged(std: Floats | None, same: Bools) -> Floats | None:
 
 
 def _plausible(power: Floats, error: Floats, most: Floats) -> tuple[Floats, Floats]:
+    # NaN is not within.
+    if all_of(np.maximum(np.abs(power), error) <= most) and all_of(error >= 0.0):
+        return power, error
     good = np.abs(power) <= most
     known = good & (error >= 0.0) & (error <= most)
-    if all_of(known):
-        return power, error
     return np.where(good, power, 0.0), np.where(known, error, most)
 
 
@@ -92,9 +93,10 @@ def measurements(
     else:
         y = np.where(available, y, 0.0)
     uses_q, q = np.zeros(frame.q.size, dtype=np.bool_), frame.q
-    # An error beyond every possible power makes the report worthless.
-    within = (frame.q_net_error >= 0.0) & (frame.q_net_error <= design.max_q)
-    reports_q = (np.abs(frame.q_net) <= design.max_q) & within
+    reports_q = np.abs(frame.q_net) <= design.max_q
+    if any_of(reports_q):
+        # An error beyond every possible power makes the report worthless.
+        reports_q &= (frame.q_net_error >= 0.0) & (frame.q_net_error <= design.max_q)
     if any_of(reports_q):
         known = np.zeros(frame.q.size, dtype=np.bool_)
         known[plant.meters] = available & trusted
@@ -388,6 +390,10 @@ class FrameUncertainty:
     before_silence: FrameUncertainty | None = (
         None  # while no meter reports: the uncertainty at the last report
     )
+    usual: bool = field(init=False)  # derived: all powers as in the design, on every scale
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "usual", all_of(self.p <= 1.0) and all_of(self.q <= 1.0))
 
 
 def nominal_uncertainty(design: SequentialDesign) -> FrameUncertainty:
@@ -474,12 +480,11 @@ def _updated(
     frame, lengths = usual(frame), design.lengths
     withheld, unread = _withheld(design, frame, available)
     exact = None if unread is None else _customers(design, unread)
-    p, p_calm, p_rest = _factors(
-        frame.p_error, design.doubt.even_p, (before.p, before.p_ticks, before.p_next), lengths, exact
-    )
-    q, q_calm, q_rest = _factors(
-        frame.q_error, design.doubt.even_q, (before.q, before.q_ticks, before.q_next), lengths, exact
-    )
+    calm_p, calm_q = (before.p, before.p_ticks, before.p_next), (before.q, before.q_ticks, before.q_next)
+    if not (before.usual and exact is None and _within(design, frame)):
+        calm_p = _factors(frame.p_error, design.doubt.even_p, calm_p, lengths, exact)
+        calm_q = _factors(frame.q_error, design.doubt.even_q, calm_q, lengths, exact)
+    (p, p_calm, p_rest), (q, q_calm, q_rest) = calm_p, calm_q
     sizes = _claim_sizes(np.abs(frame.p), design.options.hidden_power, before.sizes)
     metered, calm = _known_scales(busbar, before.busbar, before.busbar_ticks, lengths)
     before = _update_checks(before, withheld, unread, lengths)
@@ -523,6 +528,12 @@ def _updated(
         sizes=sizes,
         before_silence=None,
     )
+
+
+def _within(design: SequentialDesign, frame: Frame) -> bool:
+    """All powers known about as well as the design supposes."""
+    doubt = design.doubt
+    return all_of(frame.p_error <= _WIDER * doubt.even_p) and all_of(frame.q_error <= _WIDER * doubt.even_q)
 
 
 def _update_checks(
@@ -617,7 +628,7 @@ def _factor(error: Floats, known: Floats, old: Floats, exact: Bools | None) -> F
 
     The ratio itself where `exact`, else a power of two.
     """
-    if exact is None and all_of(error <= _WIDER * known) and all_of(old <= 1.0):
+    if exact is None and all_of(old <= 1.0) and all_of(error <= _WIDER * known):
         return old
     ratio = error / known
     keep = (ratio <= old * _WIDER) & (ratio * _WIDER >= old) & (old > _WIDER)

@@ -105,6 +105,18 @@ def test_the_same_frames_give_the_same_answers_from_a_copied_state() -> None:
     assert [v.reason for v in answers] == [v.reason for v in verdicts[45:]]
 
 
+def test_score_and_threshold_are_those_of_any_later_access() -> None:
+    """First access after later ticks, in a copy, and in a changed verdict give the same numbers."""
+    frames, _ = played()
+    _, _, verdicts = attacked()
+    state, _, later = run(frames[:45])
+    run(frames[45:], state)
+    for one, other in zip(verdicts, later, strict=False):
+        assert np.array_equal(replace(other, reason="").threshold, one.threshold)
+        assert np.array_equal(pickle.loads(pickle.dumps(other)).score, one.score, equal_nan=True)
+        assert other.score.shape == other.threshold.shape == site().meters.shape
+
+
 def test_a_repeated_frame_changes_nothing() -> None:
     """The last answer, UNDECIDED."""
     frames, _ = played()

@@ -317,3 +317,36 @@ def test_a_shift_of_all_meters_along_an_unknown_direction_is_found() -> None:
         out.append(evidence.log_m)
     assert max(out[:30]) < limit
     assert max(out[30:33]) >= limit
+
+
+@pytest.mark.parametrize("make", [busbar, mixed])
+def test_the_precision_of_members_is_bounded_from_below(make: object) -> None:
+    """Exact by the dense covariance of the innovation; the bound holds at irregular intervals, too."""
+    assert callable(make)
+    made, random = modes(make()), np.random.default_rng(16)
+    seen = np.ones((60, 12), dtype=np.bool_)
+    seen[40:, 3] = False
+    state, more, least, t = modal.start(made, 0.0), static.start(made), None, 0.0
+    for k in range(60):
+        state, more, update = full.step(made, state, more, t, np.zeros(12), seen[k])
+        least = detector.precision(made, least, update)
+        exact = least.exact(made, update)
+        if update.exact is None:
+            assert np.allclose(exact, ((made.U / update.variance) @ made.U.T).diagonal())
+        else:
+            assert exact[3] == 0.0
+        assert (least.least <= exact * (1.0 + 1e-12)).all()
+        t += float(random.uniform(0.5, 100.0))
+
+
+@pytest.mark.parametrize("silent", [3, None])
+def test_m_is_evaluated_at_every_tick_without_all_readings(silent: int | None) -> None:
+    """Calm readings: at every `EVERY`-th tick, with a silent meter at every tick."""
+    made = modes(busbar())
+    of = signatures.columns(made, power_columns(FEEDER), np.full(24, 0.05), 0.01)
+    seen = np.arange(12) != silent
+    state, more, test = modal.start(made, 0.0), static.start(made), detector.start(made)
+    for k in range(1, 21):
+        state, more, update = full.step(made, state, more, float(k), np.zeros(12), seen)
+        test, evidence = detector.step(made, of, test, update, more, h=1.0, alert=inf)
+        assert (evidence.log_m > -inf) == (silent is not None or k % detector.EVERY == 0)

@@ -80,7 +80,7 @@ def test_equals_the_joint_gaussian(lasting: float, fault: str) -> None:
         state, more, update = full.step(made, state, more, float(k), reading)
         rows = signatures.follow(made, rows, update, more, 1.0, begun=[0] if k == onset else [])
     prepared = estimate.estimator(made)
-    found = estimate.honest(made, prepared, state, more, update)
+    found = estimate.honest(made, prepared, state, more)
     if fault != "none":
         W = made.U.T @ G
         now = signatures.joint(made, rows, more, 0)
@@ -149,9 +149,9 @@ def test_coverage_in_simulation() -> None:
             flick = np.sqrt(model.flicker) * random.standard_normal()
             truth = w + busbar + flick
             m = truth[model.meters] + b + np.sqrt(model.white) * random.standard_normal(5)
-            state, more, update = full.step(made, state, more, float(k), m)
+            state, more, _ = full.step(made, state, more, float(k), m)
             w = rho * w + np.sqrt(1 - rho**2) * (draw @ random.standard_normal(places))
-        found = estimate.honest(made, prepared, state, more, update)
+        found = estimate.honest(made, prepared, state, more)
         z.append((found.mean - truth) / np.sqrt(found.variance))
     spread = np.sqrt(np.mean(np.square(z), axis=0))
     assert ((spread > 0.75) & (spread < 1.3)).all()
@@ -171,3 +171,16 @@ def test_the_honest_source_agrees_with_its_model() -> None:
     exact = model.loads(at) + model.static(at) + model.noise(at)
     assert np.abs(np.cov(m.T) - exact).max() < 0.1 * exact.max()
     assert power_columns(FEEDER).shape == (9, 18)
+
+
+def test_factors_of_the_regression_are_the_whole() -> None:
+    """``of_b`` and ``of_e`` by the modes and a few directions: the busbar's, and those of unequal meters."""
+    model = some_meters(lasting=0.3)
+    made = modes(model)
+    prepared = estimate.estimator(made)
+    w, b, e = np.random.default_rng(4).standard_normal((3, 5))
+    expected = prepared.of_w @ w + prepared.of_b @ b + prepared.of_e @ e
+    assert np.allclose(estimate._mean(prepared, w, b, e), expected, rtol=0.0, atol=1e-12)
+    even = some_meters(lasting=0.3)
+    even = replace(even, white=np.full(5, 1e-5), fixed=np.full(5, 2e-5))
+    assert estimate.estimator(modes(even)).left.shape[1] <= 2
