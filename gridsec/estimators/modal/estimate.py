@@ -13,7 +13,9 @@ linear in the posterior of (w, b, theta), and its variance follows.
 A fault f at an onset moves the filter by its signature g and the residuals by u f; false powers and a false
 busbar voltage move the model as well, by ``effect``. With amounts of the mean f and the covariance of
 `gridsec.estimators.modal.costs`, the estimate moves by ``T f`` and its variance grows by ``diag(T cov T')``.
-Several explanations are mixed with their weights; their disagreement is part of the variance.
+Several explanations are mixed with their weights; their disagreement is part of the variance. The weights
+are only as right as the model. An explanation of at least the weight `DOUBT` keeps meters from being named;
+it counts in the variance with at least the share `POSSIBLE`.
 
 References
 ----------
@@ -32,7 +34,7 @@ from gridsec.arrays import Bools, Floats, indices, submatrix
 from gridsec.estimators.modal.costs import SearchProblem, amounts, mean_amounts
 from gridsec.estimators.modal.filter import FilterState, Full
 from gridsec.estimators.modal.model import Modes
-from gridsec.estimators.modal.search import Identification
+from gridsec.estimators.modal.search import DOUBT, Identification
 from gridsec.estimators.modal.signatures import Joint
 from gridsec.estimators.modal.static import Static
 from gridsec.estimators.sequential.output import PENDING, BoundedEstimate, BoundInputs
@@ -40,6 +42,8 @@ from gridsec.interface import Estimate
 
 ROUNDING = 1e-12
 """Relative size of singular values that are rounding, 1."""
+POSSIBLE = 0.05
+"""Least share in the variance of an explanation that is not beyond doubt, 1: it is within 4.5 deviations."""
 COUNTED = 1e-5
 """Weight from which on an explanation counts in the estimate, 1: 100 deviations apart, it adds a tenth."""
 
@@ -269,7 +273,9 @@ def corrected(before: Sequence[Estimated], T: Sequence[Floats], found: Identific
 
     def spread() -> Floats:
         each = [before[k].variance + _of_amounts(T[k], found.problems[k], chosen) for k, chosen in every]
-        return np.asarray(weight @ (np.stack(each) + (means - mean) ** 2))
+        apart = (means - mean) ** 2
+        possible = apart[weight >= DOUBT].max(axis=0)
+        return np.asarray(np.maximum(weight @ (np.stack(each) + apart), POSSIBLE * possible))
 
     return Estimated(mean, spread)
 

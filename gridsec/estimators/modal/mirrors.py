@@ -5,9 +5,10 @@ Where the meters ``J & g`` are off by one amount x, the meters ``g - J`` differ 
 lies outside of g tells which of both are right. Unread powers, unlearned classes and large loads hide that.
 No prior of meters may decide then: the mirror image has the penalty of J,
 
-    cost(J') = cost(J) + L(J') - min(L(J), L_one(J)),     L = -y' (F + 1 / s^2)^-1 y + log det(1 + s^2 F)
+    cost(J') = cost(J) + L(J') - min(L(J), L_one(J)),     L = -y' (F + V^-1)^-1 y + log det(1 + V F)
 
-with L(J') and L_one(J) of one amount for the exchanged meters. So readings alone decide between both.
+with L(J') and L_one(J) of one amount for the exchanged meters. So readings alone decide between both. L is
+the mean of the likelihoods with independent amounts V and with amounts alike, as in `search`, for all sets.
 
 **Laterals.** ``J' = J xor g``, with and without the false powers of J, for every group of neighbours but the
 whole feeder. A majority of a lateral that agrees is believed only as far as others confirm it.
@@ -21,7 +22,7 @@ doubt all others of its phase.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -31,7 +32,7 @@ from gridsec.arrays import Bools, Ints, any_of, submatrix
 from gridsec.estimators.modal.costs import BELIEVED, SearchProblem, informed
 from gridsec.estimators.modal.laterals import clusters, coded
 from gridsec.estimators.modal.model import Modes
-from gridsec.estimators.modal.search import DOUBT, Identification
+from gridsec.estimators.modal.search import ALIKE, DOUBT, Identification
 
 REFLECTED = 0.01
 """Weight from which on an explanation has mirror images, 1: that of reported explanations."""
@@ -102,7 +103,7 @@ def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iter
     """Mirror images of a set, (q,), and their costs beyond its own."""
     p, b = near.phases.shape
     read = informed(problem)
-    independent = _likelihood(problem, np.flatnonzero(chosen), None)
+    likelihood = _Likelihood(problem, chosen)
     for phase in range(b):
         image, column = _of_phase(chosen, near, phase, read)
         if image is not None:
@@ -112,7 +113,7 @@ def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iter
                     np.stack([chosen[:p], image[:p]]), (near.laterals & read).astype(np.float64), read
                 )
                 more = float(both[1] - both[0] + problem.charge[image].sum() - problem.charge[chosen].sum())
-            yield image, max(more, 0.0) + _apart(problem, chosen & image, column, independent)
+            yield image, max(more, 0.0) + _apart(likelihood, chosen & image, column)
     done = set[bytes]()
     for lateral in near.laterals & read:
         accused, others = lateral & chosen[:p], lateral & ~chosen[:p]
@@ -122,8 +123,8 @@ def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iter
         done.add(key)
         rest = chosen.copy()
         rest[:p] &= ~lateral
-        own = _likelihood(problem, np.flatnonzero(rest), accused)
-        if own - independent > APART:
+        own = likelihood(rest, accused)
+        if own - likelihood.own > APART:
             continue
         for powers in (True, False) if any_of(rest[p:-b]) else (True,):
             dropped = 0.0
@@ -132,8 +133,7 @@ def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iter
                 rest[p:-b] = False
             image = rest.copy()
             image[:p] |= others
-            like = _likelihood(problem, np.flatnonzero(rest), others)
-            yield image, like - min(independent, own) - dropped
+            yield image, likelihood(rest, others) - min(likelihood.own, own) - dropped
 
 
 def _of_phase(chosen: Bools, near: Neighbourhoods, phase: int, read: Bools) -> tuple[Bools | None, Bools]:
@@ -151,18 +151,46 @@ def _of_phase(chosen: Bools, near: Neighbourhoods, phase: int, read: Bools) -> t
     return (image if any_of(accused) and count <= near.most else None), accused
 
 
-def _apart(problem: SearchProblem, rest: Bools, column: Bools, independent: float) -> float:
-    """Cost of one amount in place of independent ones, at least 0; infinite for `APART`."""
-    more = _likelihood(problem, np.flatnonzero(rest), column) - independent
+def _apart(likelihood: _Likelihood, rest: Bools, column: Bools) -> float:
+    """Cost of one amount in place of several, at least 0; infinite for `APART`."""
+    more = likelihood(rest, column) - likelihood.own
     return max(more, 0.0) if more <= APART else np.inf
 
 
-def _likelihood(problem: SearchProblem, at: Ints, alike: Bools | None) -> float:
-    """L of faults `at` with independent amounts, and of meters `alike` (p,) with one amount."""
+class _Likelihood:
+    """L of sets near one, (q,), with the priors of the amounts that count for it."""
+
+    def __init__(self, problem: SearchProblem, chosen: Bools) -> None:
+        self.problem, self.charge = problem, float(problem.charge.max(initial=0.0))
+        shares = {share: self._with(chosen, None, share) for share in (0.0, ALIKE)}
+        least = min(shares.values())
+        # A prior that is far worse for the set is so for its images.
+        self.shares = [share for share, one in shares.items() if one <= least + APART]
+        self.own = _mean(shares[share] for share in self.shares)
+
+    def __call__(self, rest: Bools, column: Bools) -> float:
+        """L of the faults `rest` (q,) and of the meters `column` (p,) with one amount."""
+        return _mean(self._with(rest, column, share) for share in self.shares)
+
+    def _with(self, rest: Bools, column: Bools | None, share: float) -> float:
+        at = np.flatnonzero(rest)
+        if np.count_nonzero(at < self.problem.meters) < 2:
+            share = 0.0
+        return _likelihood(self.problem, at, column, share) + (self.charge if share else 0.0)
+
+
+def _mean(each: Iterable[float]) -> float:
+    """L of the mean of the likelihoods."""
+    half = -0.5 * np.fromiter(each, np.float64)
+    return -2.0 * float(np.logaddexp.reduce(half) - np.log(half.size))
+
+
+def _likelihood(problem: SearchProblem, at: Ints, column: Bools | None, share: float = 0.0) -> float:
+    """L of faults `at`, their meters with a share of the variance in common, and of one for `column` (p,)."""
     n, y, std = at.size, problem.y[at], problem.std[at]
     F = submatrix(problem.F, at, at)
-    if alike is not None:
-        together = np.flatnonzero(alike)
+    if column is not None:
+        together = np.flatnonzero(column)
         side, inner = problem.F[together].sum(axis=0), F
         F = np.empty((n + 1, n + 1))
         F[:n, :n], F[n, :n], F[:n, n], F[n, n] = inner, side[at], side[at], side[together].sum()
@@ -170,6 +198,13 @@ def _likelihood(problem: SearchProblem, at: Ints, alike: Bools | None) -> float:
     if not y.size:
         return 0.0
     pull, A = std * y, std[:, None] * F * std
+    if share:
+        # With the root R of the prior's correlation: R y and R F R.
+        k = np.count_nonzero(at < problem.meters)
+        own = np.sqrt(1.0 - share)
+        common = (np.sqrt(1.0 - share + share * k) - own) / k
+        for one in (pull, A, A.T):
+            one[:k] = own * one[:k] + common * one[:k].sum(axis=0)
     A[np.diag_indices(y.size)] += 1.0
     half, found, failed = lapack.dposv(A, pull, lower=True)
     if failed:

@@ -111,6 +111,21 @@ def test_a_mixture_contains_the_disagreement() -> None:
     assert np.allclose(after.variance, 1e-4 + own + f**2)
 
 
+@pytest.mark.parametrize(("weight", "least"), [(2e-3, estimate.POSSIBLE), (2e-4, 0.0)])
+def test_a_possible_explanation_has_a_least_share(weight: float, least: float) -> None:
+    """An explanation that keeps a meter from being named counts with at least 5 %; others hardly."""
+    F = np.diag([100.0, 100.0])
+    problem = SearchProblem(np.array([50.0, 50.0]), F, np.ones(2), 2, np.zeros(2), np.full(2, np.inf))
+    chosen, weights = np.array([[True, False], [False, True]]), np.array([1.0 - weight, weight])
+    found = Identification(chosen, np.zeros(2, np.intp), weights, np.zeros(2, bool), (problem,))
+    before = estimate.Estimated(np.zeros(1), lambda: np.array([1e-4]))
+    after = estimate.corrected([before], [np.array([[1.0, -1.0]])], found)
+    means = np.array([1.0, -1.0]) * 50.0 / 101.0
+    apart = (means - weights @ means) ** 2
+    mixed = 1e-4 + 1.0 / 101.0 + weights @ apart
+    assert np.allclose(after.variance, max(mixed, least * apart[1]))
+
+
 def test_the_variance_is_evaluated_once_and_where_asked_for() -> None:
     asked = []
 

@@ -11,6 +11,7 @@ from benchmarks._residuals import Source, model_of, power_columns, tree
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.modal import core, mirrors
 from gridsec.estimators.modal.core import Core
+from gridsec.estimators.modal.costs import SearchProblem
 from gridsec.estimators.modal.search import Identification
 from tests.gridsec.estimators.modal.test_search import problem
 
@@ -50,6 +51,40 @@ def test_likelihoods_of_one_amount_are_exact() -> None:
     want = np.linalg.slogdet(np.eye(5) + V @ F)[1] - y @ np.linalg.solve(np.eye(5) + V @ F, V @ y)
     assert np.isclose(mirrors._likelihood(given, rest, alike), want)
     assert mirrors._likelihood(given, np.zeros(0, dtype=np.intp), None) == 0.0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.99])
+def test_likelihoods_of_amounts_alike_are_exact(share: float) -> None:
+    """Three meters with a share of their variance in common, a power, and two meters with one amount."""
+    given, at = problem(4, p=8, others=2), np.array([0, 3, 6, 9, 1, 2])
+    given = replace(given, std=np.linspace(0.5, 2.0, 10))
+    correlation = np.eye(6)
+    correlation[:3, :3] += share * (1.0 - np.eye(3))
+    correlation[4:, 4:] = 1.0
+    std = np.append(given.std[at[:4]], given.std[[0, 0]])
+    V = std[:, None] * correlation * std
+    F, y = given.F[np.ix_(at, at)], given.y[at]
+    want = np.linalg.slogdet(np.eye(6) + V @ F)[1] - y @ np.linalg.solve(np.eye(6) + V @ F, V @ y)
+    column = np.isin(np.arange(8), at[4:])
+    assert np.isclose(mirrors._likelihood(given, at[:4], column, share), want)
+
+
+def test_a_mirror_image_costs_as_much_as_its_set_where_readings_agree() -> None:
+    """Six meters off alike, one of them in a group with two others: no image is cheaper than the set."""
+    random, p = np.random.default_rng(5), 8
+    F = np.linalg.inv(0.002 * np.eye(p) + 0.05)
+    truth = np.arange(p) < 6
+    y = F @ (1.0 * truth) + np.linalg.cholesky(F) @ random.standard_normal(p)
+    given = SearchProblem(
+        np.append(y, 0.0), np.eye(p + 1), np.ones(p + 1), p, np.zeros(p + 1), np.full(9, np.inf)
+    )
+    given.F[:p, :p] = F
+    laterals = np.zeros((1, p), dtype=np.bool_)
+    laterals[0, 5:] = True
+    near = mirrors.Neighbourhoods(laterals, np.zeros((p, 1), dtype=np.bool_), p)
+    chosen = np.append(truth, False)
+    images = list(mirrors._images(given, chosen, near))
+    assert all(more > 0.0 for _, more in images)
 
 
 def test_a_majority_of_a_lateral_is_ambiguous_where_nothing_else_confirms_it() -> None:
