@@ -183,7 +183,7 @@ OLD_LAYOUT = sa.Table(
 
 def put_back_workers(connection: sa.Connection) -> None:
     """Make a database one of version 7."""
-    for table in (schema.WORKER, schema.SHARD, schema.FEEDER_CHANGES, schema.SIGNED):
+    for table in (schema.WORKER, schema.SHARD, schema.FEEDER_CHANGES, schema.SIGNED, schema.OBSERVER):
         table.drop(connection)
     connection.exec_driver_sql("ALTER TABLE writer DROP COLUMN worker")
     connection.exec_driver_sql("ALTER TABLE feeder DROP COLUMN version")
@@ -258,7 +258,7 @@ def test_a_database_from_before_suspicions_were_kept_is_brought_forward(url: str
         StateSnapshot("village", T0, "[]", SnapshotKind.DISTRUST),
     )
     with Store(url) as old, old._write() as connection:
-        old._put_kept(connection, learned)
+        old._put_kept(connection, [learned])
         put_back(connection, 2, schema.DISTRUST, schema.WRITER)
     with Store(url) as new:
         assert new.distrust("village") is None
