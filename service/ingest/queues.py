@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -74,7 +74,7 @@ THINNED_FROM = 512
 """Length of a feeder's queue from which its keys are thinned to equal numbers."""
 
 THINNED = 8
-"""Divisor of the largest number of samples of a key that are dropped at once."""
+"""Divisor of the length of such a queue: this part is dropped at once. A drop reads the whole queue."""
 
 
 @dataclass(slots=True)
@@ -86,22 +86,34 @@ class _Lane:
     offered: int = 0  # number of all samples so far
 
     def drop(self) -> int:
-        """Drop the oldest sample, or the oldest ones of the keys with the most; return their number."""
-        counts = Counter(sample.key for sample in self.waiting) if len(self.waiting) > THINNED_FROM else {}
-        most = max(counts.values(), default=1)
-        if most == 1:
+        """Drop the oldest sample; of a long queue a part, of the keys with the most. Return the number."""
+        if len(self.waiting) <= THINNED_FROM:
             self.bytes -= _size(self.waiting.popleft())
             return 1
-        left = most - max(1, most // THINNED)
+        counts = Counter(sample.key for sample in self.waiting)
+        due = dropped = len(self.waiting) // THINNED
+        left = _level(counts.values(), due)
         kept: deque[Sample] = deque()
         for sample in self.waiting:
-            if counts[sample.key] > left:
+            if due and counts[sample.key] > left:
                 counts[sample.key] -= 1
+                due -= 1
                 self.bytes -= _size(sample)
             else:
                 kept.append(sample)
-        dropped, self.waiting = len(self.waiting) - len(kept), kept
+        self.waiting = kept
         return dropped
+
+
+def _level(counts: Iterable[int], due: int) -> int:
+    """Return the largest number such that the parts of some counts above it sum up to at least `due`."""
+    keys = Counter(counts)
+    level, reached, above = max(keys), 0, 0
+    while reached < due:
+        above += keys[level]
+        reached += above
+        level -= 1
+    return level
 
 
 class Inbox:

@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import threading
+import time
+from collections import Counter
+from collections.abc import Callable
 
-from service.ingest.queues import Inbox, Sample
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from service.ingest.queues import THINNED, THINNED_FROM, Inbox, Sample
 
 
 def sample(number: int, size: int = 10) -> Sample:
@@ -51,6 +57,41 @@ def test_what_has_been_taken_out_is_counted_no_more() -> None:
         box.put([sample(k, 1_000)])
     assert keys(box.drain(10)) == [9_997, 9_998, 9_999]
     assert box.put([sample(k, 100) for k in range(4)]) == 0
+
+
+def test_a_flood_of_new_keys_is_not_slower_than_one_of_a_single_key() -> None:
+    """Each sample beyond the limit is processed in constant time on average."""
+
+    def seconds(key: Callable[[int], str]) -> float:
+        box = Inbox(lambda: None, max_samples=20_000, lossless=False)
+        flood = [Sample(key(k), b"{}", "", 0.0, 2) for k in range(40_000)]
+        begun = time.thread_time()
+        for at in range(0, 40_000, 1000):
+            box.put(flood[at : at + 1000])
+        return time.thread_time() - begun
+
+    once, pairs, same = seconds(str), seconds(lambda k: str(k // 2)), seconds(lambda _: "a")
+    assert max(once, pairs) < 20.0 * same + 0.1
+
+
+@given(st.lists(st.integers(0, 40), min_size=THINNED_FROM + 1, max_size=THINNED_FROM + 200))
+@settings(max_examples=30)
+def test_a_long_queue_drops_of_the_keys_with_the_most(numbers: list[int]) -> None:
+    most = len(numbers)
+    box = Inbox(lambda: None, max_samples=most, lossless=False)
+    numbers = [*numbers, 0]
+    dropped = box.put([sample(k) for k in numbers])
+    assert dropped == (most + 1) // THINNED
+    kept = keys(box.drain(2 * most))
+    before, after = Counter(numbers), Counter(kept)
+    # A key that has lost samples has at most one less than the others that have more than it.
+    fewest = min(after[k] for k in before if after[k] < before[k])
+    assert all(after[k] <= fewest + 1 for k in before)
+    # The newest of each key stay, in their order.
+    for k in before:
+        assert after[k] > 0
+    newest = {k: [at for at, one in enumerate(numbers) if one == k][-after[k] :] for k in before}
+    assert kept == [numbers[at] for at in sorted(at for each in newest.values() for at in each)]
 
 
 def test_lossless_lets_the_sender_wait() -> None:
