@@ -8,6 +8,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -91,18 +92,21 @@ class _Lane:
             self.bytes -= _size(self.waiting.popleft())
             return 1
         counts = Counter(sample.key for sample in self.waiting)
-        due = dropped = len(self.waiting) // THINNED
+        due = len(self.waiting) // THINNED
         left = _level(counts.values(), due)
+        over = {key: number - left for key, number in counts.items() if number > left}
+        # The last level is not needed of all keys.
+        for key in islice(over, sum(over.values()) - due):
+            over[key] -= 1
         kept: deque[Sample] = deque()
         for sample in self.waiting:
-            if due and counts[sample.key] > left:
-                counts[sample.key] -= 1
-                due -= 1
+            if over.get(sample.key):
+                over[sample.key] -= 1
                 self.bytes -= _size(sample)
             else:
                 kept.append(sample)
         self.waiting = kept
-        return dropped
+        return due
 
 
 def _level(counts: Iterable[int], due: int) -> int:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections import Counter
-from collections.abc import Callable
+from random import Random
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
+import pytest
 
 from service.ingest.queues import THINNED, THINNED_FROM, Inbox, Sample
 
@@ -59,39 +57,24 @@ def test_what_has_been_taken_out_is_counted_no_more() -> None:
     assert box.put([sample(k, 100) for k in range(4)]) == 0
 
 
-def test_a_flood_of_new_keys_is_not_slower_than_one_of_a_single_key() -> None:
-    """Each sample beyond the limit is processed in constant time on average."""
-
-    def seconds(key: Callable[[int], str]) -> float:
-        box = Inbox(lambda: None, max_samples=20_000, lossless=False)
-        flood = [Sample(key(k), b"{}", "", 0.0, 2) for k in range(40_000)]
-        begun = time.thread_time()
-        for at in range(0, 40_000, 1000):
-            box.put(flood[at : at + 1000])
-        return time.thread_time() - begun
-
-    once, pairs, same = seconds(str), seconds(lambda k: str(k // 2)), seconds(lambda _: "a")
-    assert max(once, pairs) < 20.0 * same + 0.1
-
-
-@given(st.lists(st.integers(0, 40), min_size=THINNED_FROM + 1, max_size=THINNED_FROM + 200))
-@settings(max_examples=30)
-def test_a_long_queue_drops_of_the_keys_with_the_most(numbers: list[int]) -> None:
-    most = len(numbers)
+@pytest.mark.parametrize("keys_of_queue", [1, 2, 4, 41, 100_000])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_long_queue_drops_of_the_keys_with_the_most(keys_of_queue: int, seed: int) -> None:
+    random = Random(seed)
+    most = random.randint(THINNED_FROM + 1, THINNED_FROM + 200)
+    numbers = [random.randrange(keys_of_queue) for _ in range(most + 1)]
     box = Inbox(lambda: None, max_samples=most, lossless=False)
-    numbers = [*numbers, 0]
-    dropped = box.put([sample(k) for k in numbers])
-    assert dropped == (most + 1) // THINNED
+    # An eighth is dropped at once: a flood of distinct keys does not read the whole queue for each sample.
+    assert box.put([sample(k) for k in numbers]) == (most + 1) // THINNED
     kept = keys(box.drain(2 * most))
     before, after = Counter(numbers), Counter(kept)
     # A key that has lost samples has at most one less than the others that have more than it.
     fewest = min(after[k] for k in before if after[k] < before[k])
     assert all(after[k] <= fewest + 1 for k in before)
     # The newest of each key stay, in their order.
-    for k in before:
-        assert after[k] > 0
-    newest = {k: [at for at, one in enumerate(numbers) if one == k][-after[k] :] for k in before}
-    assert kept == [numbers[at] for at in sorted(at for each in newest.values() for at in each)]
+    places = {k: [at for at, one in enumerate(numbers) if one == k] for k in before}
+    newest = [at for k, all_ in places.items() for at in all_[len(all_) - after[k] :]]
+    assert kept == [numbers[at] for at in sorted(newest)]
 
 
 def test_lossless_lets_the_sender_wait() -> None:
