@@ -189,7 +189,9 @@ def test_zoom_by_pointer_and_keyboard(opened: Callable[..., Page], live: tuple[I
     tip = page.locator(".series-tip")
     expect(tip).to_contain_text("attacked")
     expect(tip).to_contain_text(
-        re.compile(rf"{meters[LIAR]} reported 2\d\d\.\d\d V, reconstructed 2\d\d\.\d\d V \(band")
+        re.compile(
+            rf"{meters[LIAR]} · LV1\.101 Load 2 reported 2\d\d\.\d\d V, reconstructed 2\d\d\.\d\d V \(band"
+        )
     )
     page.locator("#series-out").click()
     assert chosen_time(page) == (7200.0, None)
