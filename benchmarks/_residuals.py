@@ -8,6 +8,8 @@ from math import exp
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints
+from gridsec.estimators.modal import core
+from gridsec.estimators.modal.core import Core
 from gridsec.estimators.modal.model import ResidualModel
 from gridsec.grid.network import Power
 from gridsec.grid.radial import Feeder
@@ -93,6 +95,19 @@ def model_of(
         time_s=time_s,
         fixed_s=fixed_s,
     )
+
+
+def tree_core(number: int, salt: int, sizes: tuple[int, int]) -> tuple[Core, Feeder]:
+    """Core of a random tree with unread powers as faults, and the tree.
+
+    number, salt: seed; even and odd numbers differ in the errors of their meters. sizes: least number of
+    customers, and one more than the largest.
+    """
+    random = np.random.default_rng([number, salt])
+    feeder = tree(int(random.integers(*sizes)), random)
+    model = model_of(feeder, jitter=(5e-4, 2e-3)[number % 2])
+    powers = feeder.columns(Power.ACTIVE, np.arange(feeder.bus.size))
+    return core.assemble(model, powers, np.full(feeder.bus.size, 0.14), gamma=1e6), feeder
 
 
 def power_columns(feeder: Feeder) -> Floats:

@@ -29,11 +29,10 @@ from itertools import pairwise
 import numpy as np
 
 from benchmarks._arguments import arguments
-from benchmarks._residuals import BASE_KVA, Source, model_of, power_columns, tree
+from benchmarks._residuals import BASE_KVA, Source, power_columns, tree_core
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.modal import core
 from gridsec.estimators.modal.core import Core
-from gridsec.grid.network import Power
 
 QUIET, EARLIEST, LATEST = 100, 5, 60
 """Honest ticks, and ticks from the onset to the look."""
@@ -50,12 +49,8 @@ EDGES = np.array([0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 0.999, 1.0 + 1e-9])
 @lru_cache(maxsize=TREES)
 def kernel_of(number: int) -> tuple[Core, Floats]:
     """Core of one tree, and the effect of its customers' active powers on the meters."""
-    random = np.random.default_rng([number, 3])
-    feeder = tree(int(random.integers(8, 21)), random)
-    model = model_of(feeder, jitter=(5e-4, 2e-3)[number % 2])
-    every = np.arange(feeder.bus.size)
-    powers = feeder.columns(Power.ACTIVE, every)
-    return core.assemble(model, powers, np.full(every.size, 0.14), gamma=1e6), power_columns(feeder)[:, every]
+    kernel, feeder = tree_core(number, 3, (8, 21))
+    return kernel, power_columns(feeder)[:, : feeder.bus.size]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

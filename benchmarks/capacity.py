@@ -33,7 +33,7 @@ from feeders.model.site import Site, load
 from feeders.simulation.scenario import Scenario, simulate
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import MeterClient
-from tests.service.databases import find_postgresql
+from tests.service.databases import installed_postgresql
 from tests.service.databases import running as running_server
 
 LEAST = 64
@@ -125,10 +125,7 @@ def cost(site: Site, feeders: int, tick_s: float, seconds: float, *, workers: bo
         database, place = None, folder / "state"
         place.mkdir()
         if workers:
-            binaries = find_postgresql()
-            if binaries is None:
-                raise SystemExit("PostgreSQL's initdb, pg_ctl and postgres are not installed")
-            server = stack.enter_context(running_server(binaries))
+            server = stack.enter_context(running_server(installed_postgresql()))
             database, place = server.database(), server.folder
         begun = time.monotonic()
         service = stack.enter_context(

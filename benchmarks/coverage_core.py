@@ -34,7 +34,7 @@ from functools import lru_cache
 import numpy as np
 
 from benchmarks._arguments import arguments
-from benchmarks._residuals import BASE_KVA, model_of, root, tree
+from benchmarks._residuals import BASE_KVA, root, tree_core
 from gridsec.arrays import Floats, Ints
 from gridsec.estimators.modal import core, verdict
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
@@ -56,12 +56,8 @@ SURE, FAR = 1.959964, 6.0
 @lru_cache(maxsize=TREES)
 def kernel_of(number: int) -> tuple[Core, Floats]:
     """Core of one tree, and the effect of its customers' active powers on the places."""
-    random = np.random.default_rng([number, 7])
-    feeder = tree(int(random.integers(9, 19)), random)
-    model = model_of(feeder, jitter=(5e-4, 2e-3)[number % 2])
-    every = np.arange(feeder.bus.size)
-    powers = feeder.columns(Power.ACTIVE, every)
-    return core.assemble(model, powers, np.full(every.size, 0.14), gamma=1e6), np.asarray(powers)
+    kernel, feeder = tree_core(number, 7, (9, 19))
+    return kernel, np.asarray(feeder.columns(Power.ACTIVE, np.arange(feeder.bus.size)))
 
 
 class World:

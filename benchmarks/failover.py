@@ -19,7 +19,7 @@ import httpx
 from benchmarks._arguments import arguments
 from feeders.model.site import load
 from tests.service.clusters import served_cluster
-from tests.service.databases import find_postgresql, running
+from tests.service.databases import installed_postgresql, running
 from tests.service.failovers import Fault, Trial
 
 WORKERS = 3
@@ -32,11 +32,8 @@ def main() -> None:
     if unknown:
         raise SystemExit(f"unknown: {', '.join(sorted(unknown))}; faults: {', '.join(Fault)}")
     faults = [Fault(name) for name in given.faults] or list(Fault)
-    binaries = find_postgresql()
-    if binaries is None:
-        raise SystemExit("PostgreSQL's initdb, pg_ctl and postgres are not installed")
     with (
-        running(binaries) as server,
+        running(installed_postgresql()) as server,
         tempfile.TemporaryDirectory(prefix="gridsec-failover-") as folder,
         served_cluster(
             *(Path(folder), server.database(), load("cigre-lv"), given.feeders, WORKERS),

@@ -54,7 +54,7 @@ from service.report.tick_state import TickState
 from service.store import Store
 from service.store.committer import Committer
 from tests.service.databases import Cluster as Server
-from tests.service.databases import find_postgresql
+from tests.service.databases import installed_postgresql
 from tests.service.databases import running as running_server
 
 FEEDER = "kerber-vorstadtnetz"
@@ -484,10 +484,7 @@ def main() -> int:
         print_against(site, asked.seconds, Path(asked.against).resolve())
         return 0
     if asked.workers:
-        binaries = find_postgresql()
-        if binaries is None:
-            raise SystemExit("PostgreSQL's initdb, pg_ctl and postgres are not installed")
-        with running_server(binaries) as server:
+        with running_server(installed_postgresql()) as server:
             print_fleet(site, asked.seconds, asked.most, server)
         return 0
     tick = print_stages(site)

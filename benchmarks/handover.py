@@ -21,7 +21,7 @@ from service.engine.replay import ReplayCounts, replay
 from service.ingest.align import Clock
 from service.ingest.queues import Sample
 from service.store import Store
-from service.store.state_codec import StateSnapshot
+from service.store.state_codec import MonitorState, StateSnapshot
 
 START, FIRST_S, WATCHED_S = 1_795_212_000.0, 30.0, 14.0
 
@@ -66,7 +66,8 @@ def _until_clean(
 ) -> int:
     """Ticks before the first CLEAN verdict from a time on; all of them if none is CLEAN."""
     later = [one for one in recorded if since <= one.t < since + WATCHED_S]
-    verdicts = [one.state.verdict for one in replay(site, later, ReplayCounts(), observer=observer)]
+    results = replay(site, later, ReplayCounts(), past=MonitorState(observer=observer))
+    verdicts = [one.state.verdict for one in results]
     return verdicts.index(Decision.CLEAN) if Decision.CLEAN in verdicts else len(verdicts)
 
 

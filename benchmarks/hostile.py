@@ -18,7 +18,7 @@ from benchmarks._arguments import arguments
 from feeders.model.site import load
 from tests.service import hostile
 from tests.service.clusters import ServedCluster, served_cluster
-from tests.service.databases import find_postgresql, running
+from tests.service.databases import installed_postgresql, running
 from tests.service.running import until
 
 FEEDER = "cigre-lv"
@@ -32,13 +32,10 @@ def decided(live: ServedCluster) -> None:
 def main() -> int:
     """Measure, and print a table."""
     asked = arguments(__doc__, seconds=20.0, feeders=4)
-    binaries = find_postgresql()
-    if binaries is None:
-        raise SystemExit("PostgreSQL's initdb, pg_ctl and postgres are not installed")
     missed = False
     print("| processes | attack | list, s | age, s | late | failed | memory, MB | log lines |", flush=True)
     print("|---|---|---|---|---|---|---|---|", flush=True)
-    with running(binaries) as server:
+    with running(installed_postgresql()) as server:
         for kind, options in hostile.KINDS.items():
             with (
                 tempfile.TemporaryDirectory(prefix="gridsec-hostile-") as folder,

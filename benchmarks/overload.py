@@ -50,7 +50,7 @@ from feeders.simulation.scenario import Scenario, simulate
 from service.cli.simulate import key_of
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import MeterClient
-from tests.service.databases import find_postgresql
+from tests.service.databases import installed_postgresql
 from tests.service.databases import running as running_server
 
 FEEDER = "kerber-vorstadtnetz"
@@ -385,9 +385,7 @@ def main() -> int:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         database = None
         if asked.workers:
-            if (binaries := find_postgresql()) is None:
-                raise SystemExit("PostgreSQL's initdb, pg_ctl and postgres are not installed")
-            database = stack.enter_context(running_server(binaries)).database()
+            database = stack.enter_context(running_server(installed_postgresql())).database()
         for name in names:
             tables = site.tables
             write(replace(tables, meta=replace(tables.meta, name=name)), folder / name)

@@ -39,7 +39,7 @@ import psycopg
 from benchmarks._arguments import arguments
 from feeders.model.site import load
 from tests.service.clusters import LIE_VOLT, Process, ServedCluster, served_cluster
-from tests.service.databases import Cluster, find_postgresql, running
+from tests.service.databases import Cluster, installed_postgresql, running
 from tests.service.running import until
 
 FEEDER = "cigre-lv"
@@ -335,11 +335,8 @@ def soak(live: ServedCluster, server: Cluster, seconds: float) -> list[str]:
 def main() -> int:
     """Measure."""
     asked = arguments(__doc__, seconds=3600.0, feeders=12)
-    binaries = find_postgresql()
-    if binaries is None:
-        raise SystemExit("PostgreSQL's initdb, pg_ctl and postgres are not installed")
     with (
-        running(binaries) as server,
+        running(installed_postgresql()) as server,
         tempfile.TemporaryDirectory(prefix="gridsec-soak-") as folder,
         served_cluster(
             Path(folder),

@@ -21,32 +21,21 @@ from typing import Generic, Protocol, TypeVar
 from gridsec.arrays import changed
 from gridsec.interface import Cause, Decision
 from service.alarms.state_machine import AlarmKind, AlarmRules
+from service.report.report import Judged
 
 _UNHEARD = frozenset({Cause.SILENT_METERS, Cause.NO_BUSBAR})
 """Causes of missing readings; the meters may not be silent yet."""
 
 
-class Judged(Protocol):
-    """Tick with a verdict, such as `TickState`."""
-
-    @property
-    def t(self) -> float:
-        """Unix time, s."""
-
-    @property
-    def verdict(self) -> Decision:
-        """Raw verdict."""
-
-    @property
-    def cause(self) -> Cause:
-        """Its cause."""
+class Followed(Judged, Protocol):
+    """Tick with a verdict that the display follows, such as `TickState`."""
 
     @property
     def skipped(self) -> int:
         """Number of skipped ticks directly before."""
 
 
-T = TypeVar("T", bound=Judged)
+T = TypeVar("T", bound=Followed)
 
 
 @dataclass(frozen=True, slots=True)

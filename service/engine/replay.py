@@ -14,7 +14,7 @@ from service.alarms.state_machine import AlarmBook
 from service.engine.feeder_monitor import FeederMonitor, TickResult, align_rules, design, known_of
 from service.ingest.align import Clock, ReadingOutcome
 from service.ingest.reading import T_MAX, T_MIN, BadReason, Findings, Known, Reading, judge, to_reading
-from service.store.state_codec import MonitorState, StateSnapshot
+from service.store.state_codec import MonitorState
 
 
 @dataclass(slots=True)
@@ -40,9 +40,7 @@ def replay(
     clock: Clock = Clock.EVENTS,
     max_skew_s: float | None = None,
     grace_s: float | None = None,
-    kept: StateSnapshot | None = None,
-    distrust: StateSnapshot | None = None,
-    observer: StateSnapshot | None = None,
+    past: MonitorState | None = None,
     skipped: Sequence[tuple[float, float]] = (),
 ) -> Iterator[TickResult]:
     """Yield the service's results for recorded readings.
@@ -52,16 +50,13 @@ def replay(
     clock: source of the present time: the readings, or, as in live operation, the wall clock of their
         arrival.
     max_skew_s, grace_s: as in `align.rules`.
-    kept: state of the meters' errors at the start of the recording, as in `FeederCommissioning`; None for
-        none.
-    distrust: distrusted devices at the start, as in `Suspicions`; None for none.
-    observer: observer at the start, as in `ObserverHandover`; None for none.
+    past: stored state of the monitor at the start of the recording; None for none.
     skipped: first and last Unix time of ticks that the live service skipped, s; the replay skips them, too.
     Raises NotObservable, DesignInfeasible if the feeder cannot be monitored.
     """
     rules = align_rules(site, clock, max_skew_s=max_skew_s, grace_s=grace_s)
     book = AlarmBook(site.feeder.name)
-    monitor = FeederMonitor(site, rules, book, MonitorState(kept, distrust, observer))
+    monitor = FeederMonitor(site, rules, book, past)
     monitor.install(design(site))
     known = known_of(site)
     for one in recorded:

@@ -616,12 +616,8 @@ def history_row(
     )
 
 
-class Kept(Protocol):
-    """Tick that the history may keep: a report, or the part of it that the history keeps."""
-
-    @property
-    def feeder(self) -> str:
-        """Name of the feeder."""
+class Judged(Protocol):
+    """Tick with a verdict."""
 
     @property
     def t(self) -> float:
@@ -635,9 +631,21 @@ class Kept(Protocol):
     def cause(self) -> Cause:
         """Cause of the verdict."""
 
+
+class Marked(Judged, Protocol):
+    """Tick that the history may keep: a report, or the result that it is built from."""
+
     @property
     def suspects(self) -> tuple[str, ...]:
         """Meters that the verdict names as manipulated."""
+
+
+class Kept(Marked, Protocol):
+    """Part of a report that the history keeps."""
+
+    @property
+    def feeder(self) -> str:
+        """Name of the feeder."""
 
     @property
     def row(self) -> HistoryRow:

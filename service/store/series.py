@@ -15,13 +15,13 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats
-from gridsec.interface import Cause, Decision
-from service.report.report import BUSBAR, HISTORY_COLUMNS, HistoryRow, finite
+from gridsec.interface import Decision
+from service.report.report import BUSBAR, HISTORY_COLUMNS, HistoryRow, Marked, finite
 
 # --- Rows ---
 
@@ -364,26 +364,6 @@ class Mark:
     verdict: str
     cause: str
     suspects: tuple[str, ...]
-
-
-class Marked(Protocol):
-    """Tick that the history may keep: a report, or the result that it is built from."""
-
-    @property
-    def t(self) -> float:
-        """Unix time, s."""
-
-    @property
-    def verdict(self) -> Decision:
-        """Verdict."""
-
-    @property
-    def cause(self) -> Cause:
-        """Cause of the verdict."""
-
-    @property
-    def suspects(self) -> tuple[str, ...]:
-        """Meters that the verdict names as manipulated."""
 
 
 def mark(report: Marked) -> Mark:

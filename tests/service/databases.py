@@ -26,6 +26,14 @@ def find_postgresql() -> Path | None:
     return next((folder for folder in folders if all((folder / name).exists() for name in wanted)), None)
 
 
+def installed_postgresql() -> Path:
+    """Folder of PostgreSQL's programs; a program ends without them."""
+    found = find_postgresql()
+    if found is None:
+        raise SystemExit("PostgreSQL's initdb, pg_ctl and postgres are not installed")
+    return found
+
+
 class Cluster:
     """A private PostgreSQL that listens on a socket in a folder of its own and on no network."""
 

@@ -37,6 +37,7 @@ from service.ingest.zenoh_bus import MeterClient
 from service.report.report import LearningReport, StalledMeter, to_json
 from service.store import Store, StoreUnavailable
 from service.store.schema import CommissioningChange
+from service.store.state_codec import MonitorState
 from tests.codes import refused
 from tests.service.databases import both
 from tests.service.running import FEEDER, InProcess, Outlet, free_port, service, until
@@ -299,14 +300,14 @@ def test_a_replay_with_what_was_known_is_what_the_restarted_service_said(
 ) -> None:
     with Store(f"sqlite:///{tmp_path}/s.db") as store:
         feed(rounds(store, site), samples(honest, 0, 70))
-        kept = store.commission(FEEDER)
+        past = MonitorState(store.commission(FEEDER))
     outlet = Outlet()
     with Store(f"sqlite:///{tmp_path}/s.db") as store:
         live = rounds(store, site)
         live.committer.publisher = outlet
         feed(live, samples(honest, 100, 130))
     later = [r for r in honest if START + 100 <= r.t < START + 130]
-    told = [json.loads(json.dumps(to_json(r.report))) for r in replay(site, later, ReplayCounts(), kept=kept)]
+    told = [json.loads(json.dumps(to_json(r.report))) for r in replay(site, later, ReplayCounts(), past=past)]
     assert len(outlet.estimates) >= 28
     assert told[: len(outlet.estimates)] == outlet.estimates
     # And it matters: without what was learned the numbers are others.

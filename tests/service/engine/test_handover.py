@@ -23,7 +23,7 @@ from service.ingest.align import Clock
 from service.ingest.queues import Sample
 from service.report.report import to_json
 from service.store import Store
-from service.store.state_codec import SnapshotKind, StateSnapshot
+from service.store.state_codec import MonitorState, SnapshotKind, StateSnapshot
 from tests.service.engine.test_commissioning import START, samples
 from tests.service.engine.test_suspicions import Told
 from tests.service.running import FEEDER
@@ -106,10 +106,10 @@ def test_a_replay_with_the_stored_observer_gives_the_same_reports(
 ) -> None:
     _, site, _ = killed
     with Store(left) as store:
-        kept, observer = store.commission(FEEDER), store.observer(FEEDER)
+        past = MonitorState(store.commission(FEEDER), observer=store.observer(FEEDER))
     later = [one for one in readings if START + END + 2 <= one.t < START + END + 12]
     said, _ = restarted(left, site, samples(readings, END + 2, END + 12))
-    results = replay(site, later, ReplayCounts(), kept=kept, observer=observer)
+    results = replay(site, later, ReplayCounts(), past=past)
     assert len(said) >= 8
     assert [json.loads(json.dumps(to_json(one.report))) for one in results][: len(said)] == said
 

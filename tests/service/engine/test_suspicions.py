@@ -23,7 +23,7 @@ from service.engine.replay import ReplayCounts, replay
 from service.ingest.align import Clock
 from service.report.report import to_json
 from service.store import Store, StoreUnavailable
-from service.store.state_codec import StateSnapshot, encode, fingerprint
+from service.store.state_codec import MonitorState, StateSnapshot, encode, fingerprint
 from tests.service.engine.test_commissioning import START, feed, samples, variant
 from tests.service.running import FEEDER, Outlet
 
@@ -236,11 +236,10 @@ def test_a_replay_with_what_was_kept_is_what_the_restarted_service_said(
 ) -> None:
     later = [r for r in lying if START + END <= r.t < START + END + 20]
     with Store(f"sqlite:///{left}") as store:
-        kept, distrust = store.commission(FEEDER), store.distrust(FEEDER)
-        observer = store.observer(FEEDER)
+        past = MonitorState(store.commission(FEEDER), store.distrust(FEEDER), store.observer(FEEDER))
         live, told = watching(store, site)
         feed(live, samples(later, END, END + 20))
-    results = replay(site, later, ReplayCounts(), kept=kept, distrust=distrust, observer=observer)
+    results = replay(site, later, ReplayCounts(), past=past)
     said = [json.loads(json.dumps(to_json(result.report))) for result in results]
     assert len(told.estimates) >= 18
     assert said[: len(told.estimates)] == told.estimates
