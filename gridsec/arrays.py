@@ -5,7 +5,8 @@ Nothing here has a hidden tolerance: every number that decides is an argument.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +14,16 @@ from numpy.typing import NDArray
 from gridsec.errors import InputInvalid, Problem
 
 __all__ = [
+    "PENDING",
     "Bools",
+    "Deferred",
     "Floats",
     "Ints",
     "Phasors",
     "all_of",
     "any_of",
     "changed",
+    "deferred",
     "exponential_integrals",
     "frozen",
     "frozen_ints",
@@ -179,16 +183,48 @@ def perron_bound(matrix: Floats, rounds: int) -> float:
     return best
 
 
+PENDING: Floats = np.zeros(0)
+"""Value of a deferred field before the first access."""
+
+
+class Deferred:
+    """Field of a class with slots that its subclass computes on first access, where it is `PENDING`."""
+
+    def __init__(self, slot: Any, compute: Callable[[Any], Floats]) -> None:
+        self._slot, self._compute, self.__doc__ = slot, compute, compute.__doc__
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> Deferred: ...
+
+    @overload
+    def __get__(self, instance: object, owner: type) -> Floats: ...
+
+    def __get__(self, instance: object, owner: type) -> Deferred | Floats:
+        if instance is None:
+            return self
+        found: Floats = self._slot.__get__(instance)
+        if found is PENDING:
+            found = self._compute(instance)
+            self._slot.__set__(instance, found)
+        return found
+
+    def __set__(self, instance: object, value: Floats) -> None:
+        self._slot.__set__(instance, value)
+
+
+def deferred(parent: type) -> Callable[[Callable[[Any], Floats]], Deferred]:
+    """Return the decorator of a method that computes the field of the same name of a parent class."""
+    return lambda compute: Deferred(parent.__dict__[compute.__name__], compute)
+
+
 if TYPE_CHECKING:
     # Type checkers know `replace` and the type of each field.
     from dataclasses import replace as changed
 else:
-    from collections.abc import Callable
     from dataclasses import fields, replace
     from functools import cache
     from operator import attrgetter
     from types import MemberDescriptorType
-    from typing import Any
 
     def changed(value: Any, /, **new: Any) -> Any:
         """Copy of a frozen dataclass with other values in some fields.

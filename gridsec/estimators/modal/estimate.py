@@ -30,14 +30,14 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, indices, submatrix
+from gridsec.arrays import PENDING, Bools, Floats, deferred, indices, submatrix
 from gridsec.estimators.modal.costs import SearchProblem, amounts, mean_amounts
 from gridsec.estimators.modal.filter import FilterState, Full
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.search import DOUBT, Identification
 from gridsec.estimators.modal.signatures import Joint
 from gridsec.estimators.modal.static import Static
-from gridsec.estimators.sequential.output import PENDING, BoundedEstimate, BoundInputs
+from gridsec.estimators.sequential.output import BoundedEstimate, BoundInputs
 from gridsec.interface import Estimate
 
 ROUNDING = 1e-12
@@ -302,16 +302,7 @@ class Reconstructed(BoundedEstimate):
         object.__setattr__(made, "_variance", variance)
         return made
 
-    @property
+    @deferred(Estimate)
     def std(self) -> Floats:
         """Standard deviation of `v2`, (N,)."""
-        slot = Estimate.__dict__["std"]
-        found: Floats = slot.__get__(self)
-        if found is PENDING:
-            found = np.sqrt(self._variance()[self._grounds.plant.feeder.bus])
-            slot.__set__(self, found)
-        return found
-
-    @std.setter
-    def std(self, value: Floats) -> None:
-        Estimate.__dict__["std"].__set__(self, value)
+        return np.sqrt(self._variance()[self._grounds.plant.feeder.bus])

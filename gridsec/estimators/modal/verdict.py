@@ -19,13 +19,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cache
 from math import inf, log
 from typing import Any
 
 import numpy as np
 from scipy.linalg import lapack
 
-from gridsec.arrays import Bools, Floats, all_of, any_of, indices
+from gridsec.arrays import PENDING, Bools, Floats, all_of, any_of, deferred, indices
 from gridsec.estimators.detection import DecisionInputs, decide
 from gridsec.estimators.modal import detector, masking, signatures
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
@@ -38,7 +39,6 @@ from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.device_checks import probability
 from gridsec.estimators.sequential.measurements import largest_offset, unusable_offsets
 from gridsec.estimators.sequential.output import (
-    PENDING,
     busbar_deviation,
     clock_sentence,
     explanations_sentence,
@@ -155,34 +155,18 @@ class Answer(Verdict):
     ) -> Answer:
         """Verdict with the function `amounts` of score and threshold, (p,) each; `rest` as in `Verdict`."""
         made = cls(*finding, suspects, PENDING, PENDING, attack, **rest)
-        object.__setattr__(made, "_amounts", amounts)
+        object.__setattr__(made, "_amounts", cache(amounts))
         return made
 
-    @property
+    @deferred(Verdict)
     def score(self) -> Floats:
         """Residual of each meter, squared pu, (p,); NaN without a reading."""
-        return self._found("score")
+        return self._amounts()[0]
 
-    @score.setter
-    def score(self, value: Floats) -> None:
-        Verdict.__dict__["score"].__set__(self, value)
-
-    @property
+    @deferred(Verdict)
     def threshold(self) -> Floats:
         """Largest score of an honest meter, squared pu, (p,)."""
-        return self._found("threshold")
-
-    @threshold.setter
-    def threshold(self, value: Floats) -> None:
-        Verdict.__dict__["threshold"].__set__(self, value)
-
-    def _found(self, name: str) -> Floats:
-        slot = Verdict.__dict__[name]
-        if slot.__get__(self) is PENDING:
-            for each, value in zip(("score", "threshold"), self._amounts(), strict=True):
-                Verdict.__dict__[each].__set__(self, value)
-        found: Floats = slot.__get__(self)
-        return found
+        return self._amounts()[1]
 
 
 def deviations(core: Core, state: CoreState, m: Floats) -> tuple[Floats, Floats]:

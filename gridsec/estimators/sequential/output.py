@@ -23,7 +23,7 @@ from functools import partial
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, changed
+from gridsec.arrays import PENDING, Bools, Floats, Ints, all_of, any_of, changed, deferred
 from gridsec.estimators.detection import DecisionInputs, decide
 from gridsec.estimators.plant import NO_VOLTAGE, Plant, busbar_errors
 from gridsec.estimators.sequential.design import SequentialDesign
@@ -643,9 +643,6 @@ def _intersection(low: Floats, high: Floats, other_low: Floats, other_high: Floa
 
 
 # Placeholder of a bound that is not computed yet.
-PENDING: Floats = np.zeros(0)
-
-
 class BoundedEstimate(Estimate):
     """Estimate with a bound computed on first access, which takes half a step.
 
@@ -665,16 +662,7 @@ class BoundedEstimate(Estimate):
         object.__setattr__(made, "_grounds", grounds)
         return made
 
-    @property
+    @deferred(Estimate)
     def bound(self) -> Floats:
         """Half-width of the interval around `v2` that contains the truth within the stated errors, (N,)."""
-        slot = Estimate.__dict__["bound"]
-        found: Floats = slot.__get__(self)
-        if found is PENDING:
-            found = self._grounds.half_width(self.v2)
-            slot.__set__(self, found)
-        return found
-
-    @bound.setter
-    def bound(self, value: Floats) -> None:
-        Estimate.__dict__["bound"].__set__(self, value)
+        return self._grounds.half_width(self.v2)
