@@ -291,6 +291,11 @@ export class Series {
   changed() {
     this.tools();
     this.onChange();
+    if (this.data) { // The loaded data stand on the chosen axis until the others come.
+      const [from, to] = this.range();
+      this.data = { ...this.data, from, to };
+      this.draw();
+    }
     this.load();
   }
 
@@ -560,8 +565,10 @@ export class Series {
     this.chosenBox?.setAttribute("visibility", "hidden");
   }
 
-  // The loaded data on another axis: the time t, s, stands at a share of the width.
+  // The loaded data on another axis: the time t, s, stands at a share of the width. Responses under way are
+  // dropped, since their axis is an earlier one; the end of the gesture loads again.
   preview(wanted, t, share) {
+    this.turn += 1;
     const span = Math.min(LONGEST_S, Math.max(SHORTEST_S, wanted));
     const until = Math.min(this.present(), t + (1 - share) * span);
     this.data = { ...this.data, from: until - span, to: until };

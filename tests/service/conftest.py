@@ -21,7 +21,7 @@ import pytest
 import uvicorn
 from anyio import CapacityLimiter
 from fastapi import FastAPI
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser, expect, sync_playwright
 from pydantic import TypeAdapter
 
 from gridsec.errors import FeederInvalid
@@ -54,6 +54,9 @@ CHROMIUM = [
     *("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync"),
 ]
+
+PAGE_PATIENCE_MS = 30_000.0
+"""Time limit of an expectation on a page, ms: that of actions, for machines with little processor time."""
 
 NOMINAL = 230.94
 
@@ -488,6 +491,7 @@ def browser() -> Iterator[Browser]:
     found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if found is None:
         pytest.skip("no Chromium on this machine")
+    expect.set_options(timeout=PAGE_PATIENCE_MS)
     with sync_playwright() as playwright:
         made = playwright.chromium.launch(executable_path=found, args=CHROMIUM)
         yield made

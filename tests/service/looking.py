@@ -63,7 +63,6 @@ class Site:
     def open(self, size: dict[str, int] | None = None, path: str = "/", **options: Any) -> Page:
         context = self.browser.new_context(viewport=size or DESKTOP, **options)  # type: ignore[arg-type]
         page = context.new_page()
-        page.set_default_timeout(10_000)
         page.on("console", lambda m: self.complaints.append(m.text) if m.type == "error" else None)
         page.on("pageerror", lambda error: self.complaints.append(str(error)))
         page.on("dialog", lambda dialog: self.complaints.append(f"dialog: {dialog.message}"))

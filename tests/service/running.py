@@ -23,6 +23,9 @@ from service.settings import settings
 FEEDER = "simbench-lv-rural1"
 PATIENCE_S = 60.0
 
+DESIGNING = "design of the monitor is not finished"
+"""Part of a reason of `/readyz`."""
+
 
 def free_port() -> int:
     """Return a port that is free and stays free: below those that the system hands out by itself."""
@@ -139,7 +142,11 @@ def service(
     client: BusConfig | None = None,
     **given: Any,
 ) -> Iterator[InProcess]:
-    """Run a service until the block ends. With `client`, the meters' session, it needs `zenoh_config`."""
+    """Run a service until the block ends. With `client`, the meters' session, it needs `zenoh_config`.
+
+    The block begins after the design of all monitors: the number of UNDECIDED ticks before it depends on
+    the machine.
+    """
     zenoh = f"tcp/127.0.0.1:{free_port()}"
     chosen = settings(
         {
@@ -175,6 +182,7 @@ def service(
             httpx.Client(base_url=found["running"].url, timeout=10.0) as http,
             MeterClient(config, chosen.prefix) as meters,
         ):
+            until(lambda: DESIGNING not in http.get("/readyz").text, "the design of the monitors")
             yield InProcess(http, meters, zenoh)
     finally:
         if "loop" in found:

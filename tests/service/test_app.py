@@ -335,7 +335,6 @@ def test_a_stored_feeder_that_cannot_be_loaded_any_more_is_shown_until_somebody_
             store.commit(put=(name, {**tables[name], "feeder": {**tables[name]["feeder"], "limits": limits}}))
             store.commit([raised(an_alarm(k, feeder=name))])
     with service(tmp_path, clock="events") as live:
-        until(lambda: "designed" not in live.http.get("/readyz").text, "the designs")
         ready = live.http.get("/readyz")
         assert ready.status_code == 503
         assert [reason.partition(":")[0] for reason in ready.json()["reasons"]] == [

@@ -338,10 +338,10 @@ def test_a_list_that_may_not_be_complete_says_so(site: Site) -> None:
     site.service.waits = (2, "database: it is locked")
     told = page.locator("#alarm-unstored")
     words = "Alarms may be missing here, 2 changes wait. database: it is locked"
-    expect(told).to_have_text(words, timeout=10_000)
+    expect(told).to_have_text(words)
     expect(page.locator("#alarm-none")).to_be_hidden()
     site.service.waits = (0, None)
-    expect(told).to_be_hidden(timeout=10_000)
+    expect(told).to_be_hidden()
     expect(page.locator("#alarm-none")).to_be_visible()
 
 
@@ -421,7 +421,7 @@ def test_a_lost_connection_is_said_and_healed(site: Site) -> None:
         expect(page.locator(old)).to_have_css("filter", "grayscale(1)")
     site.tick(T0 + 4, 8)
     site.server = site.serve(site.service, site.server.port)
-    expect(page.locator("#link")).to_have_text("live", timeout=20_000)
+    expect(page.locator("#link")).to_have_text("live")
     expect(page.locator("#decision")).to_have_text("CLEAN")
     expect(page.locator(".alarm")).to_have_count(0)
 
@@ -452,7 +452,7 @@ def test_a_state_that_is_old_when_it_comes_is_not_live(site: Site) -> None:
     site.server.stop()
     expect(page.locator("#link")).to_contain_text("connection lost, data 40 min old")
     site.server = site.serve(site.service, site.server.port)
-    expect(page.locator("#link")).to_contain_text("data stale", timeout=20_000)
+    expect(page.locator("#link")).to_contain_text("data stale")
     expect(page.locator("#decision")).to_have_text("NO LIVE DATA")
     site.service.delay_s = 0.0
     site.tick(T0 + 1)
@@ -475,7 +475,7 @@ def test_alarms_that_come_no_more_look_old_while_states_go_on(site: Site) -> Non
     expect(page.locator(".alarm-list")).to_have_css("filter", "grayscale(1)")
     expect(page.locator(".table")).to_have_css("filter", "none")
     page.unroute(ALARMS)
-    expect(page.locator("#link")).to_have_text("live", timeout=10_000)
+    expect(page.locator("#link")).to_have_text("live")
     expect(page.locator(".alarm-list")).to_have_css("filter", "none")
 
 

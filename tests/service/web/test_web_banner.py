@@ -118,7 +118,7 @@ def test_without_a_connection_the_page_is_dimmed_and_states_it(
     expect(page.locator("#next a")).to_have_attribute("href", "operator-guide#no-data")
     site.server = site.serve(site.service, site.server.port)
     site.tick(T0 + 2)
-    expect(bar).to_be_hidden(timeout=20_000)
+    expect(bar).to_be_hidden()
     expect(page.locator("#decision")).to_have_text("CLEAN")
     assert main.evaluate("e => getComputedStyle(e, '::after').content") == "none"
 

@@ -174,7 +174,7 @@ def test_a_thousand_feeders_and_the_filter(site_of: Callable[..., Site], village
     # A feeder that becomes attacked comes to the top within two updates.
     page.fill("#fleet-filter", "")
     tick(site, villages[500], T0 + 1.0, lies={"H0": 9.0, "H1": 9.0})
-    expect(page.locator("#fleet-rows tr:not(.gap)").first).to_contain_text("V0500", timeout=10_000)
+    expect(page.locator("#fleet-rows tr:not(.gap)").first).to_contain_text("V0500")
     expect(page).to_have_title(re.compile(r"^2 ATTACKED \| "))
 
 

@@ -29,7 +29,6 @@ def test_the_page_asks_for_a_key_and_shows_the_identity(
     with service(tmp_path) as running:
         context = browser.new_context(viewport=size, color_scheme=scheme)  # type: ignore[arg-type]
         page = context.new_page()
-        page.set_default_timeout(10_000)
         page.goto(str(running.http.base_url))
         expect(page.locator("#login")).to_be_visible()
         assert contrast(page, "#login :is(h2, p, label, button, code)") > READABLE

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from feeders.model.site import load
 from feeders.simulation.scenario import Scenario
@@ -53,7 +53,6 @@ def opened(browser: Browser, live: tuple[InProcess, list[str]]) -> Iterator[Call
         base = str(live[0].http.base_url).rstrip("/")
         context = browser.new_context(viewport=size or WIDE, color_scheme=scheme)  # type: ignore[arg-type]
         page = context.new_page()
-        page.set_default_timeout(10_000)
         page.on("console", lambda m: complaints.append(m.text) if m.type == "error" else None)
         page.on("pageerror", lambda error: complaints.append(str(error)))
         page.goto(f"{base}/{path}")
@@ -259,6 +258,29 @@ def test_two_fingers_zoom_and_move_and_a_touchpad_does(site: Site) -> None:
     assert chosen_time(page)[0] == pytest.approx(span, rel=0.02)
     assert (end or 0.0) - (chosen_time(page)[1] or 0.0) == pytest.approx(0.25 * span, rel=0.05)
     assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+
+
+def test_a_gesture_during_a_load_keeps_its_range(site: Site) -> None:
+    """The response of an earlier choice does not move the axis under the fingers."""
+    site.tick(T0, 30)
+    page = site.open(WIDE, "/#village?series=H3&span=3600&until=1795212000")
+    expect(page.locator("#series-chart .panel")).to_have_count(1)
+    page.locator("#series-chart").scroll_into_view_if_needed()
+    frame = page.locator("#series-chart .frame").bounding_box()
+    assert frame is not None
+    held: list[Route] = []
+    page.route("**/series?*", lambda route: route.continue_() if held else held.append(route))
+    page.click("#series-out")  # 7 200 s
+    until(lambda: page.evaluate("1") and held, "the request of the longer span")
+    page.mouse.move(frame["x"] + 0.5 * frame["width"], frame["y"] + 0.5 * frame["height"])
+    page.keyboard.down("Control")
+    page.mouse.wheel(0, -60)
+    page.keyboard.up("Control")
+    held[0].continue_()
+    expect(page).not_to_have_url(re.compile("span=7200"))
+    span, _ = chosen_time(page)
+    assert 3000.0 < span < 5000.0
+    expect(page.locator("#series-chart .panel")).to_have_count(1)
 
 
 def test_a_choice_that_does_not_exist_is_left_out(site: Site) -> None:
