@@ -370,6 +370,8 @@ class Bus:
                             key,
                             encoding=JSON,
                             congestion_control=zenoh.CongestionControl.DROP,
+                            # The session's own subscription of readings matches the key, too.
+                            allowed_destination=zenoh.Locality.REMOTE,
                         )
                     if not isinstance(value, bytes) and not _has_receiver(publishers[key]):
                         continue

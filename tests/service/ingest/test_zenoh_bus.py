@@ -141,6 +141,36 @@ def test_a_slow_service_keeps_the_newest_and_does_not_hold_up_the_sender() -> No
     assert len(numbers) < RING + 2_000
 
 
+def test_values_are_built_only_for_a_subscriber() -> None:
+    """The service's own subscription of readings matches the keys of estimates, and is no receiver."""
+    built: list[int] = []
+
+    def value(k: int) -> bytes:
+        built.append(k)
+        return b"%d" % k
+
+    sink = Sink()
+    with pair(sink) as (bus, meters, end), client(end) as watcher:
+        meters.put("f/meter/a/reading", b"{}")
+        until(lambda: sink.samples)
+        bus.telemetry("f/estimate", partial(value, 0))
+        done: list[str] = []
+        # Values and events leave in one thread.
+        assert bus.event("f/alarm/A", b"raised", last=False, done=lambda: done.append("raised"))
+        until(lambda: done)
+        bus.telemetry("f/estimate", partial(value, 1))
+        time.sleep(0.2)
+        assert built == []
+        estimates = watcher.declare_subscriber("gridsec/*/estimate", zenoh.handlers.FifoChannel(100))
+
+        def received() -> bool:
+            bus.telemetry("f/estimate", partial(value, 2))
+            return estimates.handler.try_recv() is not None
+
+        until(received)
+    assert set(built) == {2}
+
+
 def test_estimates_and_alarms_are_published_and_answer_queries() -> None:
     done: list[str] = []
     with pair(Sink()) as (bus, meters, end), client(end) as watcher:
