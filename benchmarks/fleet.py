@@ -380,7 +380,9 @@ class Fleet(threading.Thread):
             second = int(time.time()) + 1
             while not self.ended.is_set():
                 time.sleep(max(0.0, second - time.time()))
-                readings = self.seconds[second % SIMULATED]
+                # There and back again: a jump at the end would be a change of all feeders at once.
+                k = second % (2 * SIMULATED - 2)
+                readings = self.seconds[min(k, 2 * SIMULATED - 2 - k)]
                 for number, name in enumerate(self.names):
                     # A feeder's meters report at once; feeders follow each other within 0.3 s.
                     time.sleep(max(0.0, second + 0.3 * number / len(self.names) - time.time()))

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # has no stubs
 
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, NotObservable, raise_if_any
 from service.cli import (
@@ -56,6 +57,9 @@ from service.cli.console import (
 from service.cli.paths import Unusable, check_paths
 from service.cli.serve import Endpoints
 from service.cli.study_planning import as_usage_error
+
+BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
+"""Variables of the number of threads of BLAS."""
 
 if TYPE_CHECKING:
     from feeders.model.site import Site
@@ -128,9 +132,7 @@ app.command()(serve.worker)
 
 def main() -> None:
     """Run the command line; anticipated errors become one message and an exit code."""
-    # The observers are memory-bound: more BLAS threads slow each other down.
-    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+    _limit_blas()
     try:
         app()
     except GridsecError as error:
@@ -478,3 +480,16 @@ def _publish(
     except KeyboardInterrupt:
         pass
     console.out.print(f"{ticks} ticks of {len(site.meter_ids)} meters and the busbar published")
+
+
+def _limit_blas() -> None:
+    """Let BLAS use one thread, unless the environment states a number.
+
+    The observers are memory-bound: more threads wait for each other in a loop. The environment holds for
+    child processes and for libraries that are loaded later; those of the imports above have read it already.
+    """
+    given = [name for name in BLAS_THREADS if name in os.environ]
+    for variable in BLAS_THREADS:
+        os.environ.setdefault(variable, "1")
+    if not given:
+        threadpool_limits(limits=1, user_api="blas")

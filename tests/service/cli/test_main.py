@@ -27,6 +27,7 @@ from feeders.model.site import load
 from feeders.simulation.recording import read_recording
 from feeders.simulation.scenario import Scenario, random_attacks
 from service.cli.demo import DemoResult, verdict
+from service.cli.main import BLAS_THREADS
 from service.cli.simulate import Pace, play
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import MeterClient
@@ -529,3 +530,24 @@ def test_demo_does_not_check_what_need_not_show(gridsec: Run) -> None:
 
 def test_demo_of_a_feeder_that_is_none(gridsec: Run) -> None:
     assert "atlantis" in refused(3, gridsec("demo", "--feeder", "atlantis", "--duration", "30"))
+
+
+@pytest.mark.parametrize(("stated", "expected"), [(None, {1}), ("2", {2})])
+def test_blas_has_one_thread_unless_stated(stated: str | None, expected: set[int]) -> None:
+    """The libraries of the command line's own imports and later ones."""
+    environment = {k: v for k, v in os.environ.items() if k not in BLAS_THREADS}
+    if stated is not None:
+        environment["OPENBLAS_NUM_THREADS"] = stated
+    script = """
+import contextlib, sys
+from service.cli.main import main
+sys.argv = ["gridsec", "--help"]
+with contextlib.suppress(SystemExit):
+    main()
+import numpy, scipy.linalg, threadpoolctl
+print(*(one["num_threads"] for one in threadpoolctl.threadpool_info() if one["user_api"] == "blas"))
+"""
+    made = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
+    found = [int(word) for word in made.stdout.splitlines()[-1].split()]
+    assert len(found) >= 2
+    assert set(found) == expected
