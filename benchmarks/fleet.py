@@ -1,6 +1,6 @@
 """Cost of many feeders in one process: time by stage, rates of decoding, meters held at one reading a second.
 
-    python -m benchmarks.fleet [SECONDS] [MOST] [OTHER_TREE] [--costs] [--workers]
+    python -m benchmarks.fleet [SECONDS] [MOST] [FIRST] [OTHER_TREE] [--costs] [--workers]
 
 Feeders are copies of the Kerber suburban network, 146 meters and the busbar each. All ratios are of one run.
 
@@ -8,10 +8,13 @@ Feeders are copies of the Kerber suburban network, 146 meters and the busbar eac
    Arrow, CBOR and JSON. Processor time of each stage, as a multiple of the estimator's step.
 2. Rates: single messages per second of a raw zenoh subscriber in Python, and of one with decoding and
    alignment; readings per second of decoding and alignment of batches.
-3. Fleet: the service is a process of its own, this one publishes each meter once a second for SECONDS. The
-   number of feeders grows by half from 8 until a tick is late, a payload is lost or a feeder is shed, or
-   until MOST feeders. The last number that is held is printed. With --costs this part is left out.
-   With another source tree only the processor time of the service for a reading is compared, with 8 feeders.
+3. Fleet: the service is a process of its own, or with --workers a front with two workers on PostgreSQL. This
+   process publishes each meter once a second. The number of feeders grows by half from FIRST to MOST, for
+   20 s each, until a tick is late, a payload is lost or a feeder is shed. The last number is then watched for
+   SECONDS, and a tenth fewer until it is held. With --costs this part is left out. With another source tree
+   only the processor time of the service for a reading is compared, with 8 feeders.
+
+The processor time of a reading is that of the service and its workers, without the database and the sender.
 """
 
 from __future__ import annotations
@@ -36,7 +39,7 @@ import zenoh
 from pyarrow import ipc
 
 from benchmarks._arguments import arguments
-from benchmarks.overload import free_ports, metrics, running
+from benchmarks.overload import Service, free_ports, metrics, running
 from feeders.format.tables import write
 from feeders.model.site import Site, from_tables, load
 from feeders.registry import DesignedEstimator
@@ -75,7 +78,14 @@ SPREAD = 60
 SIMULATED = 60
 LATE_S = 1.0
 """Age of a tick's result, s, from which it is late."""
-FIRST, GROWTH = 8, 1.5
+FIRST, GROWTH, RETREAT = 8, 1.5, 0.9
+"""First number of feeders, and its factors while it is held and afterwards."""
+RAMP_S = 20.0
+"""Duration of a number during growth, s."""
+CLEAN_SHARE = 0.98
+"""Share of ticks that are CLEAN where a fleet is held."""
+SETTLING_S = 120.0
+"""Time limit of the start until all feeders are CLEAN, s."""
 WORKERS = 2
 
 Put = tuple[str, bytes, str]
@@ -403,6 +413,17 @@ def spent_s(process: int) -> float:
     return own + sum(spent_s(int(one)) for one in children)
 
 
+def _settle(service: Service, number: int) -> None:
+    """Wait until nearly all ticks of a few seconds are CLEAN, or `SETTLING_S` are over."""
+    end, before, begun = time.monotonic() + SETTLING_S, metrics(service), time.monotonic()
+    while time.monotonic() < end:
+        time.sleep(4.0)
+        after, lasted = metrics(service), time.monotonic() - begun
+        if (after - before)["gridsec_ticks_total clean"] > CLEAN_SHARE * lasted * number:
+            return
+        before, begun = after, time.monotonic()
+
+
 def holds(
     site: Site,
     folder: Path,
@@ -415,8 +436,7 @@ def holds(
 ) -> tuple[bool, float, str]:
     """True if that many feeders are held; processor time for a reading, s; a line of figures."""
     names = [f"feeder-{k:04d}" for k in range(number)]
-    place = folder / f"{tree.name}-{form}-{number}"
-    place.mkdir()
+    place = Path(tempfile.mkdtemp(prefix=f"{tree.name}-{form}-{number}-", dir=folder))
     for name in names:
         write(replace(site.tables, meta=replace(site.tables.meta, name=name)), place / name)
     workers, database = (0, None) if server is None else (WORKERS, server.database())
@@ -424,7 +444,7 @@ def holds(
         fleet = Fleet(site, names, form, service.zenoh)
         fleet.start()
         try:
-            time.sleep(8.0)
+            _settle(service, number)
             fleet.behind_s = 0.0
             before, begun, spent = metrics(service), time.monotonic(), spent_s(service.process.pid)
             time.sleep(seconds)
@@ -438,7 +458,7 @@ def holds(
     lost = more["gridsec_samples_dropped_total"] + more["gridsec_ticks_skipped_total"]
     delay = more["gridsec_report_delay_seconds_sum"] / max(1, more["gridsec_report_delay_seconds_count"])
     shed = after["gridsec_feeders_shed"]
-    held = clean > 0.98 and lost == 0 and delay < LATE_S and shed == 0
+    held = clean > CLEAN_SHARE and lost == 0 and delay < LATE_S and shed == 0
     text = f"{form} {number} feeders, {number * 147} sources: {clean:.3f} of the ticks clean, {lost:.0f} lost"
     text += f", {shed:.0f} shed, mean delay {delay:.2f} s, sender behind by {max(0.0, fleet.behind_s):.2f} s"
     cost /= max(1.0, more["gridsec_readings_total"])
@@ -460,17 +480,21 @@ def print_against(site: Site, seconds: float, tree: Path) -> None:
             )
 
 
-def print_fleet(site: Site, seconds: float, most: int, server: Server | None = None) -> None:
+def print_fleet(site: Site, seconds: float, first: int, most: int, server: Server | None = None) -> None:
     """Print the number of meters that one process, or two workers, hold."""
     with tempfile.TemporaryDirectory() as folder:
+
+        def held(form: str, number: int, lasting_s: float) -> bool:
+            good, _, text = holds(site, Path(folder), number, form, seconds=lasting_s, server=server)
+            print(f"{lasting_s:.0f} s, {'held' if good else 'not held'}: {text}", flush=True)
+            return good
+
         for form in ("json", "arrow"):
-            best, number = 0, FIRST
-            while number <= most:
-                held, _, text = holds(site, Path(folder), number, form, seconds=seconds, server=server)
-                print(f"{'held' if held else 'not held'}: {text}", flush=True)
-                if not held:
-                    break
+            best, number = first, first
+            while number <= most and held(form, number, min(RAMP_S, seconds)):
                 best, number = number, max(number + 1, int(number * GROWTH))
+            while seconds > RAMP_S and best > 1 and not held(form, best, seconds):
+                best = int(best * RETREAT)
             print(f"{form}: {best * len(site.meter_ids)} meters", flush=True)
 
 
@@ -480,19 +504,19 @@ TICK_MAX, SINGLES_MIN, BATCHES_MIN = 3.0, 0.2, 1e5
 
 def main() -> int:
     """Measure."""
-    asked = arguments(__doc__, seconds=20.0, most=200, against="", costs=False, workers=False)
+    asked = arguments(__doc__, seconds=20.0, most=200, first=FIRST, against="", costs=False, workers=False)
     site = load(FEEDER)
     if asked.against:
         print_against(site, asked.seconds, Path(asked.against).resolve())
         return 0
     if asked.workers:
         with running_server(installed_postgresql()) as server:
-            print_fleet(site, asked.seconds, asked.most, server)
+            print_fleet(site, asked.seconds, asked.first, asked.most, server)
         return 0
     tick = print_stages(site)
     singles, batches = print_rates(site)
     if not asked.costs:
-        print_fleet(site, asked.seconds, asked.most)
+        print_fleet(site, asked.seconds, asked.first, asked.most)
     return int(not (tick <= TICK_MAX and singles >= SINGLES_MIN and batches >= BATCHES_MIN))
 
 

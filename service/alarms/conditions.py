@@ -164,8 +164,12 @@ def _volt(value: float | None) -> str:
 def _manipulated(report: FeederReport) -> Iterable[Condition]:
     decided = report.verdict is not Decision.UNDECIDED
     for meter in report.meters:
-        known = decided and meter.seen
-        if known and not meter.suspect:
+        if not (decided and meter.seen):
+            yield Condition(
+                AlarmKind.METER_MANIPULATED, report.feeder, meter.meter, Severity.CRITICAL, known=False
+            )
+            continue
+        if not meter.suspect:
             continue
         evidence = _evidence(meter)
         reported, estimated = _volt(evidence.v_volt_reported), _volt(evidence.v_volt_estimated)
@@ -183,7 +187,6 @@ def _manipulated(report: FeederReport) -> Iterable[Condition]:
             Severity.CRITICAL,
             replace(evidence, data_error=error),
             f"reports {reported}, {beside}{hint}",
-            known,
         )
 
 
@@ -249,14 +252,11 @@ _SOUND = frozenset(
 
 
 def _voltage_limit(report: FeederReport, meter: MeterState) -> Iterable[Condition]:
-    evidence = _evidence(meter)
-    v = evidence.v_volt_estimated  # None if model only
+    v = None if meter.model_only or meter.v_volt_estimated is None else finite(meter.v_volt_estimated)
     half_width = None if meter.v_volt_std is None else finite(3.0 * meter.v_volt_std)
     low, high = meter.v_min_volt, meter.v_max_volt
     if v is None or half_width is None or low is None or high is None or report.cause not in _SOUND:
-        yield Condition(
-            AlarmKind.VOLTAGE_LIMIT, report.feeder, meter.meter, Severity.MAJOR, evidence, known=False
-        )
+        yield Condition(AlarmKind.VOLTAGE_LIMIT, report.feeder, meter.meter, Severity.MAJOR, known=False)
         return
     if low <= v <= high:
         return
@@ -267,7 +267,7 @@ def _voltage_limit(report: FeederReport, meter: MeterState) -> Iterable[Conditio
         report.feeder,
         meter.meter,
         Severity.MAJOR,
-        evidence,
+        _evidence(meter),
         f"{v:.1f} V ± {half_width:.1f} V at the connection point, {side} the limit of {limit:.1f} V",
         surely,
     )
@@ -286,6 +286,9 @@ def _data_loss(report: FeederReport) -> Iterable[Condition]:
     busbar_seen = report.busbar.seen and report.cause is not Cause.NO_BUSBAR
     if not busbar_seen and BUSBAR not in silent:
         unsure.append(BUSBAR)
+    if most:
+        unsure.extend(silent)
+        silent = {}
     for meter, seconds in silent.items():
         # Without the busbar voltage the whole feeder is not monitored.
         severity = Severity.MAJOR if meter == BUSBAR else Severity.MINOR
@@ -296,7 +299,6 @@ def _data_loss(report: FeederReport) -> Iterable[Condition]:
             severity,
             AlarmEvidence(customer=owners.get(meter)),
             f"no usable reading {_length(seconds)}",
-            known=not most,
         )
     for meter in unsure:
         yield Condition(AlarmKind.DATA_LOSS, report.feeder, meter, Severity.MINOR, known=False)

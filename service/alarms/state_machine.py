@@ -317,7 +317,9 @@ def _hold(old: Entry, t: float) -> Entry:
     """Return the entry after an unknown tick; its clock stops here."""
     # The clock stops at the first unknown tick, not at the last known one: otherwise a meter available at
     # every other tick would never raise an alarm.
-    return replace(old, held=True, t_known=old.t_known if old.held else max(old.t_known, t))
+    if old.held:
+        return old
+    return replace(old, held=True, t_known=max(old.t_known, t))
 
 
 def _timed(old: Entry | None, present: bool, t: float, backwards: bool) -> Entry:

@@ -21,27 +21,38 @@ from service.store.store import Reader
 
 AHEAD_MOST: Final = 500
 """Largest number of feeders that are loaded ahead of time."""
+READ_AT_ONCE: Final = 50
+"""Number of feeders of one read of tables: each has tens of kilobytes."""
 _log = structlog.get_logger("gridsec.cluster")
 
 
 @dataclass(frozen=True, slots=True)
 class Listed:
-    """One feeder of the database."""
+    """One feeder of the database.
+
+    version: number of the last change of its tables.
+    digest: SHA-256 of its tables.
+    meters: names of its meters.
+    """
 
     name: str
-    tables: Mapping[str, Any]
+    version: int
     digest: str
+    title: str
+    meters: tuple[str, ...]
 
-    @property
-    def title(self) -> str:
-        """Title of the feeder, or its name."""
-        return str(self.tables.get("feeder", {}).get("title") or self.name)
 
-    @property
-    def meters(self) -> tuple[str, ...]:
-        """Names of its meters."""
-        rows = self.tables.get("customers") or ()
-        return tuple(row["meter"] for row in rows if row.get("meter"))
+def listed(name: str, version: int, tables: Mapping[str, Any]) -> Listed:
+    """Return the entry of a feeder with these tables."""
+    rows = tables.get("customers") or ()
+    title = str(tables.get("feeder", {}).get("title") or name)
+    meters = tuple(row["meter"] for row in rows if row.get("meter"))
+    return Listed(name, version, digest(tables), title, meters)
+
+
+def digest(tables: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of tables, hexadecimal."""
+    return hashlib.sha256(json.dumps(tables, sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(slots=True)
@@ -52,13 +63,17 @@ class Changes:
     removed: list[str] = field(default_factory=list)
 
 
-def load(listed: Listed) -> Site | str:
+def load(tables: Mapping[str, Any]) -> Site | str:
     """Site of a feeder, or the reason why its tables cannot be loaded."""
     try:
-        return from_tables(from_json(dict(listed.tables)))
+        return from_tables(from_json(dict(tables)))
     except GridsecError as error:
         # The tables were valid when they were added; after an update the other feeders must still start.
         return "; ".join(error.problems) if isinstance(error, FeederInvalid) else str(error)
+
+
+def _differ(before: Listed | None, now: Listed) -> bool:
+    return before is None or before.digest != now.digest
 
 
 class Catalogue:
@@ -80,38 +95,50 @@ class Catalogue:
         return self._feeders
 
     def refresh(self) -> Changes:
-        """Read the feeders after a change; return what has changed. Raises StoreUnavailable."""
+        """Read the changed feeders; return what has changed. Raises StoreUnavailable.
+
+        The tables are read in parts, and are not kept.
+        """
         change = self._store.feeder_changes()
         if change == self._change:
             return Changes()
-        read = self._store.feeders()
-        found = {name: Listed(name, tables, _digest(tables)) for name, tables in read.items()}
+        versions, before = self._store.feeder_versions(), self._feeders
+        new = [name for name in versions if name not in before or before[name].version != versions[name]]
+        found = {name: one for name, one in before.items() if name in versions}
+        for begin in range(0, len(new), READ_AT_ONCE):
+            read = self._store.feeders(new[begin : begin + READ_AT_ONCE])
+            found |= {name: listed(name, versions[name], tables) for name, tables in read.items()}
         self._change = change
         with self._lock:
-            before, self._feeders = self._feeders, found
+            self._feeders = dict(sorted(found.items()))
             self._sites = {name: kept for name, kept in self._sites.items() if name in found}
-        changed = [
-            name for name, one in found.items() if name not in before or before[name].digest != one.digest
-        ]
+        changed = [name for name in new if name in found and _differ(before.get(name), found[name])]
         return Changes(changed, [name for name in before if name not in found])
 
-    def site(self, name: str) -> Site | str:
-        """Site of a feeder, or the reason why it cannot be loaded."""
-        listed = self._feeders[name]
+    def site(self, name: str) -> Site | str | None:
+        """Site of a feeder, or the reason why it cannot be loaded; None if it exists no more.
+
+        Raises StoreUnavailable.
+        """
+        entry = self._feeders[name]
         with self._lock:
             kept = self._sites.get(name)
-        if kept is not None and kept[0] == listed.digest:
+        if kept is not None and kept[0] == entry.digest:
             return kept[1]
-        made = load(listed)
+        tables = self._store.feeders((name,)).get(name)
+        if tables is None:
+            return None
+        made = load(tables)
         if isinstance(made, str):
             _log.error("a stored feeder is not monitored", feeder=name, problem=made)
         with self._lock:
-            self._sites[name] = (listed.digest, made)
+            self._sites[name] = (digest(tables), made)
         return made
 
     def sites(self, names: Iterable[str]) -> dict[str, Site | str]:
-        """Sites of feeders that exist, as of `site`."""
-        return {name: self.site(name) for name in names if name in self._feeders}
+        """Sites of feeders that exist, as of `site`. Raises StoreUnavailable."""
+        found = {name: self.site(name) for name in names if name in self._feeders}
+        return {name: site for name, site in found.items() if site is not None}
 
     def next_ahead(self, owned: Collection[str]) -> str | None:
         """Feeder of another worker to load ahead of time, or None."""
@@ -119,7 +146,3 @@ class Catalogue:
             if len(self._sites) >= AHEAD_MOST:
                 return None
             return next((one for one in self._feeders if one not in self._sites and one not in owned), None)
-
-
-def _digest(tables: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(tables, sort_keys=True).encode()).hexdigest()

@@ -24,7 +24,7 @@ from gridsec.errors import GridsecError
 from gridsec.interface import Cause, Decision
 from service.access.identity import OPEN
 from service.alarms.state_machine import Alarm, AlarmUnknown
-from service.cluster.catalogue import Catalogue
+from service.cluster.catalogue import Catalogue, digest
 from service.cluster.forward import DESIGN_S, Forwarder, Workers, get
 from service.cluster.messages import Call
 from service.engine.commissioning import CommissioningProgress
@@ -83,6 +83,8 @@ METRICS_S: Final = 5.0
 """Time limit of a worker's answer to a request for its metrics, s."""
 PUT_AGAIN_S: Final = 0.5
 """Wait before a feeder of the command line is put again, s."""
+PUT_AT_ONCE: Final = 8
+"""Number of feeders of the command line that are put at the same time."""
 T = TypeVar("T")
 _REPORT = TypeAdapter(FeederReport)
 _log = structlog.get_logger("gridsec.cluster")
@@ -212,17 +214,29 @@ class Front:
     async def _put_given(self) -> None:
         """Put the feeders of the command line into the database, through the owners of their shards."""
         await self._read.wait()
-        for name, site in self._given.items():
-            tables = json.loads(json.dumps(to_json(site.tables)))
-            while True:
-                listed = self._catalogue.feeders.get(name)
-                stored = listed is not None and listed.tables == tables
-                if not stored and (stored := await self._put(name, tables)) is None:
-                    await asyncio.sleep(PUT_AGAIN_S)
-                    continue
-                if stored:
-                    self._missing.discard(name)
-                break
+        left = iter(self._given.items())
+
+        async def put_next() -> None:
+            for name, site in left:
+                await self._put_one(name, site)
+
+        # The owners store one after the other while the next designs are made.
+        await asyncio.gather(*(put_next() for _ in range(PUT_AT_ONCE)))
+
+    async def _put_one(self, name: str, site: Site) -> None:
+        """Put one feeder until its owner takes or refuses it."""
+        tables = json.loads(json.dumps(to_json(site.tables)))
+        while True:
+            entry = self._catalogue.feeders.get(name)
+            if entry is not None and entry.digest == digest(tables):
+                stored: bool | None = True
+            else:
+                stored = await self._put(name, tables)
+            if stored:
+                self._missing.discard(name)
+            if stored is not None:
+                return
+            await asyncio.sleep(PUT_AGAIN_S)
 
     async def _put(self, name: str, tables: Mapping[str, Any]) -> bool | None:
         """True if the owner has stored the tables, False if it refuses them, None without an outcome."""

@@ -210,7 +210,9 @@ class Member:
         # An earlier owner may have stored newer tables before the claim.
         if not await self._asked("read the feeders of", self._refresh):
             return
-        found = await asyncio.to_thread(self._catalogue.sites, names)
+        found = await self._asked("read the tables of feeders of", self._catalogue.sites, names)
+        if found is None:
+            return
         self._unloaded |= {name: one for name, one in found.items() if isinstance(one, str)}
         sites = [one for one in found.values() if isinstance(one, Site)]
         for site in sites:
@@ -243,7 +245,7 @@ class Member:
             if name is None:
                 await asyncio.sleep(REFRESH_S)
             else:
-                await asyncio.to_thread(self._catalogue.sites, [name])
+                await self._asked("read the tables of feeders of", self._catalogue.sites, [name])
                 await asyncio.sleep(POLL_S)
 
     async def _asked(self, doing: str, call: Callable[..., Any], *arguments: Any) -> Any:

@@ -47,6 +47,8 @@ LAST_COMMIT_S = 1.5
 """Time limit of the last commit after `stop`, s: the service ends within 3 s."""
 IDLE_S = 1.0
 STUCK_S = 30.0
+SETTLED_S = 5.0
+"""Time after the latest design until `settled` is called, s: its cost grows with the number of feeders."""
 COMMAND_S = 10.0
 """Time limit of a command with the database, s: an earlier write and its own."""
 WAITING = 4
@@ -98,7 +100,7 @@ class Runtime:
     given: names of the feeders that REST cannot delete; None: all of them.
     unloaded: stored feeders that cannot be loaded and are not monitored, with the reason.
     wall: wall clock, Unix s.
-    settled: called between two rounds after the last unfinished design.
+    settled: called between two rounds, `SETTLED_S` after the last design.
     """
 
     def __init__(
@@ -113,6 +115,8 @@ class Runtime:
         settled: Callable[[], None] = lambda: None,
     ) -> None:
         self._wall, self._settled = wall, settled
+        # Time of the latest design, monotonic s, until `settled` is called.
+        self._installed: float | None = None
         self._stopping = False
         self._engine = Engine(
             config,
@@ -208,6 +212,7 @@ class Runtime:
         if not self._waits:
             dropped, self._dropped = self._dropped, 0
             self._engine.control(self._inbox, dropped)
+        self._settle()
         return news
 
     def _check_writer(self) -> None:
@@ -353,12 +358,16 @@ class Runtime:
     def _hand_over(self, install: Callable[[], None]) -> None:
         def run() -> None:
             install()
-            self._settle()
+            self._installed = time.monotonic()
 
         self._take_in(run)
 
     def _settle(self) -> None:
+        """Call `settled` once no design has been installed for `SETTLED_S`."""
+        if self._installed is None or time.monotonic() - self._installed < SETTLED_S:
+            return
         if all(monitor.phase is not Phase.DESIGNING for monitor in self._engine.monitors.values()):
+            self._installed = None
             self._settled()
 
     # ---------------------------------------------------------------- the backend of the API
@@ -500,7 +509,7 @@ class Runtime:
 
         def installed(monitor: FeederMonitor) -> None:
             design_jobs.install(monitor, finished, "")
-            self._settle()
+            self._installed = time.monotonic()
 
         def put() -> Future[None]:
             self._make_room(name)

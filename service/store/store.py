@@ -266,11 +266,13 @@ class Reader(IncidentReader):
         with self._read() as connection:
             return [Rejected(*row) for row in connection.execute(query)]
 
-    def feeders(self) -> dict[str, dict[str, Any]]:
-        """Return the tables of the feeders added over REST, by name."""
+    def feeders(self, names: Collection[str] | None = None) -> dict[str, dict[str, Any]]:
+        """Return the tables of the feeders added over REST, or of those with these names, by name."""
+        query = sa.select(FEEDER.c.name, FEEDER.c.tables).order_by(FEEDER.c.name)
+        if names is not None:
+            query = query.where(FEEDER.c.name.in_(names))
         with self._read() as connection:
-            rows = connection.execute(sa.select(FEEDER.c.name, FEEDER.c.tables).order_by(FEEDER.c.name))
-            return {name: json.loads(tables) for name, tables in rows}
+            return {name: json.loads(tables) for name, tables in connection.execute(query)}
 
     def feeder_changes(self) -> int:
         """Number of changes of the feeders added over REST: it differs after each one, in any process."""

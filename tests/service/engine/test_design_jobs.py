@@ -57,10 +57,10 @@ def test_what_stays_is_out_of_the_collectors_sight_and_what_is_gone_is_freed() -
         gc.unfreeze()
 
 
-def test_settled_is_when_nobody_is_being_designed_any_more(
+def test_settled_follows_the_last_design_by_a_pause(
     site: Site, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two feeders at the start, one of which takes longer; then one is put."""
+    """Two feeders at the start, one of which takes longer; then two are put, and counted once."""
     other = from_tables(from_json(called(site, OTHER)))
     goes_on, told = threading.Event(), list[dict[str, str]]()
 
@@ -70,6 +70,7 @@ def test_settled_is_when_nobody_is_being_designed_any_more(
         return design(asked, progress)
 
     monkeypatch.setattr("service.engine.design_jobs.design", slow)
+    monkeypatch.setattr("service.engine.runtime.SETTLED_S", 0.3)
 
     async def scene(store: Store) -> None:
         runtime = Runtime(RuntimeConfig(), store, [site, other], settled=lambda: told.append(phases()))
@@ -86,8 +87,12 @@ def test_settled_is_when_nobody_is_being_designed_any_more(
         while not told:  # noqa: ASYNC110
             await asyncio.sleep(0.01)
         assert told == [{FEEDER: Phase.WATCHING, OTHER: Phase.WATCHING}]
-        await runtime.put_feeder("third", called(site, "third"))
-        assert told[1:] == [dict.fromkeys((FEEDER, OTHER, "third"), Phase.WATCHING)]
+        for name in ("third", "fourth"):
+            await runtime.put_feeder(name, called(site, name))
+        assert len(told) == 1
+        while len(told) == 1:  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+        assert told[1:] == [dict.fromkeys((FEEDER, OTHER, "third", "fourth"), Phase.WATCHING)]
         runtime.stop()
         await task
 
@@ -107,6 +112,7 @@ def test_stopping_waits_for_no_feeder_that_is_being_put(
         return design(asked, progress)
 
     monkeypatch.setattr("service.engine.design_jobs.design", slow)
+    monkeypatch.setattr("service.engine.runtime.SETTLED_S", 0.3)
 
     async def scene(store: Store) -> None:
         runtime = Runtime(RuntimeConfig(), store, [site])

@@ -15,7 +15,7 @@ import pytest
 from feeders.model.site import Site, from_tables, load, to_frame
 from feeders.registry import choose
 from feeders.simulation.plant import BUSBAR as BUSBAR_SOURCE
-from gridsec.interface import Cause
+from gridsec.interface import Cause, Decision
 from service.alarms.conditions import AlarmKind, conditions
 from service.api.models import HistoryPoint
 from service.engine.feeder_monitor import design
@@ -167,7 +167,8 @@ def test_readings_that_are_not_trusted_are_no_ground(site: Site) -> None:
     tick = tick_of(START, readings, None, ())
     _, estimate, verdict = estimator.step(state, to_frame(site, snapshot(site, tick)))
     which = np.arange(len(readings)) == k
-    named = build(site, tick, 2, replace(estimate, trusted=~which), replace(verdict, suspects=which))
+    accusing = replace(verdict, decision=Decision.ATTACKED, suspects=which)
+    named = build(site, tick, 2, replace(estimate, trusted=~which), accusing)
     assert marked(named) == {True}
     (found,) = (c for c in conditions(named) if (c.kind, c.meter) == (AlarmKind.METER_MANIPULATED, "m05"))
     assert found.evidence.v_volt_estimated is None
