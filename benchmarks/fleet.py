@@ -39,7 +39,7 @@ import zenoh
 from pyarrow import ipc
 
 from benchmarks._arguments import arguments
-from benchmarks.overload import Service, free_ports, metrics, running
+from benchmarks.overload import START_S, Service, free_ports, metrics, running
 from feeders.format.tables import write
 from feeders.model.site import Site, from_tables, load
 from feeders.registry import DesignedEstimator
@@ -84,6 +84,8 @@ RAMP_S = 20.0
 """Duration of a number during growth, s."""
 CLEAN_SHARE = 0.98
 """Share of ticks that are CLEAN where a fleet is held."""
+START_EACH_S = 0.5
+"""Further time limit of the start for each feeder, s."""
 SETTLING_S = 120.0
 """Time limit of the start until all feeders are CLEAN, s."""
 WORKERS = 2
@@ -440,7 +442,8 @@ def holds(
     for name in names:
         write(replace(site.tables, meta=replace(site.tables.meta, name=name)), place / name)
     workers, database = (0, None) if server is None else (WORKERS, server.database())
-    with running(tree, place, names, workers=workers, database=database) as service:
+    start_s = START_S + START_EACH_S * number
+    with running(tree, place, names, workers=workers, database=database, start_s=start_s) as service:
         fleet = Fleet(site, names, form, service.zenoh)
         fleet.start()
         try:

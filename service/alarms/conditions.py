@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Annotated
@@ -109,10 +109,18 @@ FEW_METERS = 3
 """Number of silent meters below which each one has its own condition."""
 
 
-def conditions(report: FeederReport, *, connecting: bool = False) -> list[Condition]:
+Key = tuple[AlarmKind, str | None]
+"""Kind and subject of a condition."""
+
+
+def conditions(
+    report: FeederReport, *, connecting: bool = False, keys: Collection[Key] | None = None
+) -> list[Condition]:
     """Return the present and the unknown conditions of a feeder at one tick.
 
     connecting: a meter has had no reading since the start and is not silent yet.
+    keys: conditions of meters that may be reported as unknown, those with an alarm or a pending one: an
+        unknown condition has no other effect. None: all.
 
     - `meter-manipulated`: the verdict names the meter, or the busbar meter. Unknown while the verdict is
       UNDECIDED or the meter is unavailable, whatever the list of suspects; for the busbar meter also with an
@@ -134,12 +142,20 @@ def conditions(report: FeederReport, *, connecting: bool = False) -> list[Condit
 
     A condition that is not in the list is absent.
     """
-    manipulated = (*_manipulated(report), *_busbar(report), *_inverters(report))
+    manipulated = (*_manipulated(report, keys), *_busbar(report), *_inverters(report))
     undecided = _undecided(report, connecting=connecting)
-    found = [*manipulated, *_data_loss(report), *undecided, *_learning(report), *_clocks(report)]
+    found = [*manipulated, *_data_loss(report, keys), *undecided, *_learning(report), *_clocks(report)]
     for meter in report.meters:
-        found.extend(_voltage_limit(report, meter))
+        found.extend(_voltage_limit(report, meter, keys))
     return found
+
+
+def _unknown(
+    report: FeederReport, kind: AlarmKind, meter: str, severity: Severity, keys: Collection[Key] | None
+) -> Iterable[Condition]:
+    """The unknown condition of a meter, if it is one of `keys`."""
+    if keys is None or (kind, meter) in keys:
+        yield Condition(kind, report.feeder, meter, severity, known=False)
 
 
 def _evidence(meter: MeterState) -> AlarmEvidence:
@@ -161,13 +177,11 @@ def _volt(value: float | None) -> str:
     return "an unknown voltage" if value is None else f"{value:.1f} V"
 
 
-def _manipulated(report: FeederReport) -> Iterable[Condition]:
+def _manipulated(report: FeederReport, keys: Collection[Key] | None) -> Iterable[Condition]:
     decided = report.verdict is not Decision.UNDECIDED
     for meter in report.meters:
         if not (decided and meter.seen):
-            yield Condition(
-                AlarmKind.METER_MANIPULATED, report.feeder, meter.meter, Severity.CRITICAL, known=False
-            )
+            yield from _unknown(report, AlarmKind.METER_MANIPULATED, meter.meter, Severity.CRITICAL, keys)
             continue
         if not meter.suspect:
             continue
@@ -251,12 +265,14 @@ _SOUND = frozenset(
 )
 
 
-def _voltage_limit(report: FeederReport, meter: MeterState) -> Iterable[Condition]:
+def _voltage_limit(
+    report: FeederReport, meter: MeterState, keys: Collection[Key] | None
+) -> Iterable[Condition]:
     v = None if meter.model_only or meter.v_volt_estimated is None else finite(meter.v_volt_estimated)
     half_width = None if meter.v_volt_std is None else finite(3.0 * meter.v_volt_std)
     low, high = meter.v_min_volt, meter.v_max_volt
     if v is None or half_width is None or low is None or high is None or report.cause not in _SOUND:
-        yield Condition(AlarmKind.VOLTAGE_LIMIT, report.feeder, meter.meter, Severity.MAJOR, known=False)
+        yield from _unknown(report, AlarmKind.VOLTAGE_LIMIT, meter.meter, Severity.MAJOR, keys)
         return
     if low <= v <= high:
         return
@@ -273,7 +289,7 @@ def _voltage_limit(report: FeederReport, meter: MeterState) -> Iterable[Conditio
     )
 
 
-def _data_loss(report: FeederReport) -> Iterable[Condition]:
+def _data_loss(report: FeederReport, keys: Collection[Key] | None) -> Iterable[Condition]:
     silent = {one.meter: one.seconds for one in report.silent}
     owners = {meter.meter: meter.customer for meter in report.meters}
     most = _most_silent(report)
@@ -301,7 +317,7 @@ def _data_loss(report: FeederReport) -> Iterable[Condition]:
             f"no usable reading {_length(seconds)}",
         )
     for meter in unsure:
-        yield Condition(AlarmKind.DATA_LOSS, report.feeder, meter, Severity.MINOR, known=False)
+        yield from _unknown(report, AlarmKind.DATA_LOSS, meter, Severity.MINOR, keys)
 
 
 def _length(seconds: float | None) -> str:

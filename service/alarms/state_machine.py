@@ -27,7 +27,7 @@ from typing import Annotated, Any
 from pydantic import Field, TypeAdapter
 
 from gridsec.errors import GridsecError, InputInvalid, Problem
-from service.alarms.conditions import AlarmEvidence, AlarmKind, Condition, Severity, conditions
+from service.alarms.conditions import AlarmEvidence, AlarmKind, Condition, Key, Severity, conditions
 from service.errors import IdUnknown
 from service.times import UtcTwins
 
@@ -229,9 +229,6 @@ class AlarmRules:
     def off(self, kind: AlarmKind) -> float:
         """Return the off-delay of a kind, s."""
         return self.off_delays_s.get(kind, self.off_delay_s)
-
-
-Key = tuple[AlarmKind, str | None]
 
 
 @dataclass(frozen=True, slots=True)

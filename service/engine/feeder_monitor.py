@@ -21,6 +21,7 @@ import numpy as np
 from feeders import registry
 from feeders.model.site import PowerAges, Site, to_frame
 from feeders.registry import DesignedEstimator, ObserverMemory, WarmStart
+from gridsec.arrays import any_of
 from gridsec.estimators.sequential import SuspicionRecord
 from gridsec.interface import Cause
 from service.alarms import displayed
@@ -315,6 +316,7 @@ class FeederMonitor:
         self._mismatches: dict[str, tuple[float, str]] = {}
         self._watcher: registry.DesignedEstimator | None = None
         self._state: Any = None
+        self._read = False  # True from the first usable reading on
 
     def now(self, stored: MonitorState) -> MonitorState:
         """Return the present state for the store, with `stored` where there is none yet."""
@@ -450,7 +452,11 @@ class FeederMonitor:
                 subjects = {subject for _, subject in book.entries}
                 notable = state.notable(subjects)
                 connecting = self._connects(tick)
-                found = [] if notable is None else conditions(notable, connecting=connecting)
+                found = (
+                    []
+                    if notable is None
+                    else conditions(notable, connecting=connecting, keys=book.entries.keys())
+                )
                 held = self._unmeasured(book, tick)
                 after, transitions = advance(book, self._alarm_rules, [*found, *mismatches, *held], state.t)
             except Exception as error:  # noqa: BLE001 - ticks before and after keep their verdicts
@@ -510,6 +516,10 @@ class FeederMonitor:
             else:
                 cause, reason = Cause.SETTLING, "the design of the monitor is not finished"
             return TickState(self.site, tick, self.max_attacked, cause, reason)
+        self._read = self._read or any_of(np.isfinite(tick.values))
+        if not self._read and self.latest is not None and self.latest.judgement is not None:
+            # Without a reading since the start all ticks have the same result; to the estimator it is a pause.
+            return replace(self.latest, tick=tick)
         if self._state is None or (self.latest is not None and tick.t <= self.latest.t):
             # The first tick, or the clock was set back: earlier readings belong to another time.
             begun = self._watcher.init(tick.t, self.commissioning.known)

@@ -187,10 +187,10 @@ def test_alarms_of_before_a_defect_in_the_alarms_reach_the_database(
 ) -> None:
     """All ticks go at once, and what makes alarms of them breaks at one or from one on."""
 
-    def breaks(now: FeederReport, *, connecting: bool) -> list[Condition]:
+    def breaks(now: FeederReport, **given: Any) -> list[Condition]:
         if now.t >= START + 17 and (for_ever or now.cause is not Cause.DESIGN_INVALID):
             raise ZeroDivisionError("a defect")
-        return conditions(now, connecting=connecting)
+        return conditions(now, **given)
 
     monkeypatch.setattr("service.engine.feeder_monitor.conditions", breaks)
     wall = START - 0.5

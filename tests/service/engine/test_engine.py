@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator
@@ -226,7 +227,9 @@ def test_the_delay_of_a_report_ends_when_it_is_stored(
         monkeypatch.setattr(DesignedEstimator, "step", slow)
         for begin in (START - 0.5, START + 0.5):
             wall = begin
-            live.cycle([])
+            payload = json.dumps({"t": begin, "v_volt": 230.0}).encode()
+            key = f"gridsec/{FEEDER}/meter/{site.meter_ids[0]}/reading"
+            live.cycle([Sample(key, payload, "application/json", begin, len(payload))])
             assert "gridsec_report_delay_seconds_sum" not in live.metrics.exposition().decode()
             wall += 2.0
             while writes:
