@@ -40,7 +40,7 @@ from pyarrow import ipc
 
 from benchmarks._arguments import arguments
 from benchmarks.overload import START_S, Service, free_ports, metrics, running
-from feeders.format.tables import write
+from feeders.format.tables import to_json, write
 from feeders.model.site import Site, from_tables, load
 from feeders.registry import DesignedEstimator
 from feeders.simulation.plant import BUSBAR
@@ -439,11 +439,18 @@ def holds(
     """True if that many feeders are held; processor time for a reading, s; a line of figures."""
     names = [f"feeder-{k:04d}" for k in range(number)]
     place = Path(tempfile.mkdtemp(prefix=f"{tree.name}-{form}-{number}-", dir=folder))
-    for name in names:
-        write(replace(site.tables, meta=replace(site.tables.meta, name=name)), place / name)
-    workers, database = (0, None) if server is None else (WORKERS, server.database())
+    tables = {name: replace(site.tables, meta=replace(site.tables.meta, name=name)) for name in names}
+    workers, database, given = 0, None, names
+    if server is None:
+        for name, one in tables.items():
+            write(one, place / name)
+    else:
+        workers, database, given = WORKERS, server.database(), []
+        with Store(database) as store:
+            for name, one in tables.items():
+                store.commit(put=(name, to_json(one)))
     start_s = START_S + START_EACH_S * number
-    with running(tree, place, names, workers=workers, database=database, start_s=start_s) as service:
+    with running(tree, place, given, workers=workers, database=database, start_s=start_s) as service:
         fleet = Fleet(site, names, form, service.zenoh)
         fleet.start()
         try:

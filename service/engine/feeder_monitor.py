@@ -518,7 +518,7 @@ class FeederMonitor:
             return TickState(self.site, tick, self.max_attacked, cause, reason)
         self._read = self._read or any_of(np.isfinite(tick.values))
         if not self._read and self.latest is not None and self.latest.judgement is not None:
-            # Without a reading since the start all ticks have the same result; to the estimator it is a pause.
+            # Without a reading since the start every tick has the same result; the estimator has a pause.
             return replace(self.latest, tick=tick)
         if self._state is None or (self.latest is not None and tick.t <= self.latest.t):
             # The first tick, or the clock was set back: earlier readings belong to another time.

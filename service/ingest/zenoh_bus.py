@@ -34,7 +34,13 @@ from service.ingest.queues import (
 )
 
 RING = 8192
-"""Capacity of the subscription's queue, samples."""
+"""Capacity of a subscription's queue, samples."""
+POLL_S = 0.01
+"""Pause between two looks at the queues of single feeders, s.
+
+A thread that waits for one queue wakes ten times a second and takes the interpreter's lock: hundreds of them
+stop the others.
+"""
 
 BATCH = 1024
 _HEAD = 1024
@@ -198,6 +204,7 @@ class Bus:
         self._wall, self._missed, self._everything = wall, missed, everything
         self._live: zenoh.Session | None = None
         self._followed: dict[str, zenoh.Subscriber[Any]] = {}
+        self._closing = threading.Event()
         self._config = config
         self._prefix = prefix
         self._deliver = deliver
@@ -219,6 +226,10 @@ class Bus:
                 # Its pattern also matches wrong keys: they are reported as bad readings.
                 subscriber = self._subscribe(live, "**")
                 stack.callback(subscriber.undeclare)
+                self._start("zenoh **", self._receive, subscriber.handler)
+            else:
+                self._start("zenoh readings", self._poll, self._closing)
+                stack.callback(self._closing.set)
             for kind in ("estimate", "alarm/*", "incident/*"):
                 key = f"{self._prefix}/*/{kind}"
                 queryable = live.declare_queryable(key, zenoh.handlers.FifoChannel(QUERIES_WAITING))
@@ -256,9 +267,7 @@ class Bus:
         # A full ring drops the oldest samples; the gap shows in the sequence numbers.
         ring: Any = zenoh.handlers.FifoChannel(RING) if self._lossless else zenoh.handlers.RingChannel(RING)
         remote = zenoh.Locality.REMOTE
-        made = live.declare_subscriber(f"{self._prefix}/{pattern}", ring, allowed_origin=remote)
-        self._start(f"zenoh {pattern}", self._receive, made.handler)
-        return made
+        return live.declare_subscriber(f"{self._prefix}/{pattern}", ring, allowed_origin=remote)
 
     def follow(self, feeder: str) -> None:
         """Subscribe to the keys of one feeder; idempotent."""
@@ -271,22 +280,36 @@ class Bus:
             made.undeclare()  # type: ignore[no-untyped-call]
 
     def _receive(self, handler: zenoh.handlers.Handler[zenoh.Sample]) -> None:
+        """Deliver the samples of one subscription until it ends."""
         while True:
             try:
                 raw: zenoh.Sample | None = handler.recv()
             except zenoh.ZError:  # the subscription is closed and drained
                 return
-            batch: list[Sample] = []
-            while raw is not None:
-                key = str(raw.key_expr)
-                if self._published_by_others(key):
-                    pass
-                elif raw.kind == zenoh.SampleKind.DELETE:
-                    self.counts.deleted += 1
-                else:
-                    batch.append(self._copy(raw, key))
-                raw = _try_recv(handler) if len(batch) < BATCH else None
-            self._deliver(batch)
+            self._deliver(self._taken(handler, raw))
+
+    def _poll(self, closing: threading.Event) -> None:
+        """Deliver the samples of all followed feeders until `closing` is set; one batch of each in turn."""
+        while not closing.wait(POLL_S):
+            for made in list(self._followed.values()):
+                if batch := self._taken(made.handler, _try_recv(made.handler)):
+                    self._deliver(batch)
+
+    def _taken(
+        self, handler: zenoh.handlers.Handler[zenoh.Sample], raw: zenoh.Sample | None
+    ) -> list[Sample]:
+        """Copies of a sample and of those that wait behind it, of up to `BATCH` samples."""
+        batch: list[Sample] = []
+        while raw is not None:
+            key = str(raw.key_expr)
+            if self._published_by_others(key):
+                pass
+            elif raw.kind == zenoh.SampleKind.DELETE:
+                self.counts.deleted += 1
+            else:
+                batch.append(self._copy(raw, key))
+            raw = _try_recv(handler) if len(batch) < BATCH else None
+        return batch
 
     def _published_by_others(self, key: str) -> bool:
         """True for keys that another service with this prefix publishes."""

@@ -547,7 +547,8 @@ with contextlib.suppress(SystemExit):
 import numpy, scipy.linalg, threadpoolctl
 print(*(one["num_threads"] for one in threadpoolctl.threadpool_info() if one["user_api"] == "blas"))
 """
-    made = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
+    command = [sys.executable, "-c", script]
+    made = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     found = [int(word) for word in made.stdout.splitlines()[-1].split()]
     assert len(found) >= 2
     assert set(found) == expected
