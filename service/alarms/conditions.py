@@ -18,6 +18,7 @@ from service.report.report import (
     FeederReport,
     MeterState,
     StalledMeter,
+    Unread,
     device_name,
     finite,
     listed,
@@ -103,24 +104,23 @@ class Condition:
         return self.customer or self.meter
 
 
-MOST_SILENT = 0.5
-"""Share of a feeder's meters beyond which their silence is one condition of the feeder."""
-FEW_METERS = 3
-"""Number of silent meters below which each one has its own condition."""
-
-
 Key = tuple[AlarmKind, str | None]
 """Kind and subject of a condition."""
 
 
 def conditions(
-    report: FeederReport, *, connecting: bool = False, keys: Collection[Key] | None = None
+    report: FeederReport,
+    *,
+    connecting: bool = False,
+    keys: Collection[Key] | None = None,
+    unread: Unread | None = None,
 ) -> list[Condition]:
     """Return the present and the unknown conditions of a feeder at one tick.
 
     connecting: a meter has had no reading since the start and is not silent yet.
     keys: conditions of meters that may be reported as unknown, those with an alarm or a pending one: an
         unknown condition has no other effect. None: all.
+    unread: numbers of all meters, for a report with some of them. None: those of the report.
 
     - `meter-manipulated`: the verdict names the meter, or the busbar meter. Unknown while the verdict is
       UNDECIDED or the meter is unavailable, whatever the list of suspects; for the busbar meter also with an
@@ -142,9 +142,11 @@ def conditions(
 
     A condition that is not in the list is absent.
     """
+    if unread is None:
+        unread = Unread(len(report.meters), sum(not meter.seen for meter in report.meters))
     manipulated = (*_manipulated(report, keys), *_busbar(report), *_inverters(report))
-    undecided = _undecided(report, connecting=connecting)
-    found = [*manipulated, *_data_loss(report, keys), *undecided, *_learning(report), *_clocks(report)]
+    lost, undecided = _data_loss(report, keys, unread), _undecided(report, unread, connecting=connecting)
+    found = [*manipulated, *lost, *undecided, *_learning(report, unread.meters), *_clocks(report)]
     for meter in report.meters:
         found.extend(_voltage_limit(report, meter, keys))
     return found
@@ -289,13 +291,13 @@ def _voltage_limit(
     )
 
 
-def _data_loss(report: FeederReport, keys: Collection[Key] | None) -> Iterable[Condition]:
+def _data_loss(report: FeederReport, keys: Collection[Key] | None, unread: Unread) -> Iterable[Condition]:
     silent = {one.meter: one.seconds for one in report.silent}
     owners = {meter.meter: meter.customer for meter in report.meters}
-    most = _most_silent(report)
+    most = _most_silent(report, unread)
     if most:
-        yield _outage(report, most)
-    elif _mostly(sum(not meter.seen for meter in report.meters), report):
+        yield _outage(report, most, unread.meters)
+    elif unread.mostly(unread.unread):
         # Most meters are unavailable, and not silent yet: an outage neither begins nor ends.
         yield Condition(AlarmKind.DATA_LOSS, report.feeder, None, Severity.MAJOR, known=False)
     unsure = [meter.meter for meter in report.meters if not meter.seen and meter.meter not in silent]
@@ -324,18 +326,13 @@ def _length(seconds: float | None) -> str:
     return "yet" if seconds is None else f"for {seconds:.0f} s"
 
 
-def _most_silent(report: FeederReport) -> tuple[str, ...]:
+def _most_silent(report: FeederReport, unread: Unread) -> tuple[str, ...]:
     """The silent meters of customers, if these are most of them."""
     silent = tuple(one.meter for one in report.silent if one.meter != BUSBAR)
-    return silent if _mostly(len(silent), report) else ()
+    return silent if unread.mostly(len(silent)) else ()
 
 
-def _mostly(count: int, report: FeederReport) -> bool:
-    """True if a number of meters is most of a feeder's."""
-    return count >= FEW_METERS and count > MOST_SILENT * len(report.meters)
-
-
-def _outage(report: FeederReport, silent: tuple[str, ...]) -> Condition:
+def _outage(report: FeederReport, silent: tuple[str, ...], meters: int) -> Condition:
     """Silence of most meters: one condition of the feeder."""
     busbar = any(one.meter == BUSBAR for one in report.silent)
     known = [one.seconds for one in report.silent if one.seconds is not None]
@@ -346,21 +343,19 @@ def _outage(report: FeederReport, silent: tuple[str, ...]) -> Condition:
         None,
         Severity.MAJOR,
         AlarmEvidence(silent=(*silent, *((BUSBAR,) if busbar else ()))),
-        f"{len(silent)} of {len(report.meters)} meters have no usable reading "
-        f"{_length(min(known, default=None))}{also}",
+        f"{len(silent)} of {meters} meters have no usable reading {_length(min(known, default=None))}{also}",
     )
 
 
-def _undecided(report: FeederReport, *, connecting: bool) -> Iterable[Condition]:
+def _undecided(report: FeederReport, unread: Unread, *, connecting: bool) -> Iterable[Condition]:
     if report.verdict is not Decision.UNDECIDED:
         return
     unheard = report.cause in {Cause.SILENT_METERS, Cause.NO_BUSBAR}
-    gone = [meter.meter for meter in report.meters if not meter.seen] if unheard else []
-    if report.cause is Cause.NO_BUSBAR:
-        gone = [BUSBAR]
+    silent = {one.meter for one in report.silent}
     # A meter that is unavailable at every other tick is never silent; only this condition reports it.
-    told = bool(gone) and {*gone} <= {one.meter for one in report.silent}
-    told = told or (report.cause is Cause.TOO_FEW_METERS and bool(_most_silent(report)))
+    told = report.cause is Cause.SILENT_METERS and 0 < unread.unread == len(silent - {BUSBAR})
+    told = told or (report.cause is Cause.NO_BUSBAR and BUSBAR in silent)
+    told = told or (report.cause is Cause.TOO_FEW_METERS and bool(_most_silent(report, unread)))
     # Each of these meters has an alarm of kind `clock-offset`.
     told = told or report.cause is Cause.CLOCK_OFFSET
     yield Condition(
@@ -403,7 +398,7 @@ def _clocks(report: FeederReport) -> Iterable[Condition]:
         yield Condition(AlarmKind.CLOCK_OFFSET, report.feeder, meter, Severity.MINOR, evidence, reason)
 
 
-def _learning(report: FeederReport) -> Iterable[Condition]:
+def _learning(report: FeederReport, meters: int) -> Iterable[Condition]:
     learning = report.learning
     if learning is not None and not learning.stalled:
         return
@@ -419,7 +414,7 @@ def _learning(report: FeederReport) -> Iterable[Condition]:
         None,
         Severity.MINOR,
         AlarmEvidence(learning=stalled),
-        f"{len(stalled)} of {len(report.meters)} meters are not learned after twice the expected time{time}: "
+        f"{len(stalled)} of {meters} meters are not learned after twice the expected time{time}: "
         f"{names}; lost time: {why}",
         known=learning is not None,
     )

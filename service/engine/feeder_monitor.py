@@ -452,11 +452,10 @@ class FeederMonitor:
                 subjects = {subject for _, subject in book.entries}
                 notable = state.notable(subjects)
                 connecting = self._connects(tick)
-                found = (
-                    []
-                    if notable is None
-                    else conditions(notable, connecting=connecting, keys=book.entries.keys())
-                )
+                found = []
+                if notable is not None:
+                    keys = book.entries.keys()
+                    found = conditions(notable, connecting=connecting, keys=keys, unread=state.unread)
                 held = self._unmeasured(book, tick)
                 after, transitions = advance(book, self._alarm_rules, [*found, *mismatches, *held], state.t)
             except Exception as error:  # noqa: BLE001 - ticks before and after keep their verdicts

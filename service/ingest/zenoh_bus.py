@@ -295,9 +295,7 @@ class Bus:
                 if batch := self._taken(made.handler, _try_recv(made.handler)):
                     self._deliver(batch)
 
-    def _taken(
-        self, handler: zenoh.handlers.Handler[zenoh.Sample], raw: zenoh.Sample | None
-    ) -> list[Sample]:
+    def _taken(self, handler: zenoh.handlers.Handler[zenoh.Sample], raw: zenoh.Sample | None) -> list[Sample]:
         """Copies of a sample and of those that wait behind it, of up to `BATCH` samples."""
         batch: list[Sample] = []
         while raw is not None:

@@ -256,6 +256,8 @@ def busbar_off(site: Site, tick: Tick, verdict: Verdict) -> str:
 
 def _furthest(which: Bools, off: Floats) -> int:
     """Phase with the largest deviation among the given ones, or among all if none is given."""
+    if which.size == 1:
+        return 0
     among = which if which.any() else np.ones_like(which)
     return int(np.where(among, np.nan_to_num(np.abs(off), nan=-0.5), -1.0).argmax())
 
@@ -270,6 +272,27 @@ def _attack_volts(site: Site, reported: Floats, verdict: Verdict) -> Floats:
     """Excess of the busbar meter in phases named as manipulated, V, (b,)."""
     base = site.base_volt[site.feeder.busbar_places()]
     return excess_volts(base, reported, verdict.busbar_attack, verdict.busbar)
+
+
+# --- Silence ---
+
+
+MOST_SILENT = 0.5
+"""Share of a feeder's meters beyond which their silence is one condition of the feeder."""
+FEW_METERS = 3
+"""Number of silent meters below which each one has its own condition."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unread:
+    """Number of a feeder's meters, and of those without a usable reading."""
+
+    meters: int
+    unread: int
+
+    def mostly(self, count: int) -> bool:
+        """True if a number of meters is most of the feeder's."""
+        return count >= FEW_METERS and count > MOST_SILENT * self.meters
 
 
 # --- Reasons ---

@@ -26,6 +26,7 @@ from service.report.report import (
     LearningReport,
     ReferenceVoltages,
     Silence,
+    Unread,
     blind,
     build,
     busbar_report,
@@ -102,6 +103,12 @@ class TickState:
             return 0
         judged = ~judgement.unjudged if judgement.unjudged.size else True
         return int(np.count_nonzero(judgement.inverters & judged))
+
+    @property
+    def unread(self) -> Unread:
+        """Numbers of meters and of those without a usable reading."""
+        seen = self.tick.seen
+        return Unread(seen.size, seen.size - int(np.count_nonzero(seen)))
 
     @property
     def model_only(self) -> bool:
@@ -245,10 +252,11 @@ class TickState:
         """Meters that a condition may depend on, (p,)."""
         site, judgement = self.site, self.judgement
         which = np.zeros(site.meters.size, dtype=np.bool_)
-        if self.tick.silent or (None in subjects and not self.tick.seen.all()):
-            return ~which  # the share of the silent meters is a condition, too
-        if subjects:
-            which |= np.array([meter in subjects for meter in site.meter_ids], dtype=np.bool_)
+        # If most meters are silent, the outage is the only condition of those without an alarm.
+        silent = {meter for meter, _ in self.tick.silent} - {None}
+        named = set(subjects) if self.unread.mostly(len(silent)) else silent.union(subjects)
+        if named - {None}:
+            which |= np.array([meter in named for meter in site.meter_ids], dtype=np.bool_)
         if self.tick.clock_offset:
             which |= np.array([offset is not None for offset in self.tick.clock_offset])
         if judgement is None:
@@ -257,8 +265,6 @@ class TickState:
         if self.estimate is not None:
             v, (low, high) = volts(site.meter_volt, self.estimate.v2[site.meters]), site.meter_limits
             which |= (v < low) | (v > high)
-        if judgement.decision is Decision.UNDECIDED:
-            which |= ~self.tick.seen
         return which
 
     def _notable_inverters(self, subjects: Collection[str | None]) -> Bools:
