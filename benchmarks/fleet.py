@@ -1,6 +1,6 @@
 """Cost of many feeders in one process: time by stage, rates of decoding, meters held at one reading a second.
 
-    python -m benchmarks.fleet [SECONDS] [MOST] [FIRST] [OTHER_TREE] [--costs] [--workers]
+    python -m benchmarks.fleet [SECONDS] [MOST] [FIRST] [OTHER_TREE] [--costs] [--workers] [--arrow]
 
 Feeders are copies of the Kerber suburban network, 146 meters and the busbar each. All ratios are of one run.
 
@@ -11,8 +11,9 @@ Feeders are copies of the Kerber suburban network, 146 meters and the busbar eac
 3. Fleet: the service is a process of its own, or with --workers a front with two workers on PostgreSQL. This
    process publishes each meter once a second. The number of feeders grows by half from FIRST to MOST, for
    20 s each, until a tick is late, a payload is lost or a feeder is shed. The last number is then watched for
-   SECONDS, and a tenth fewer until it is held. With --costs this part is left out. With another source tree
-   only the processor time of the service for a reading is compared, with 8 feeders.
+   SECONDS, and a tenth fewer until it is held. With --costs this part is left out, with --arrow all but
+   batches in Arrow. With another source tree only the processor time of a reading is compared,
+   with 8 feeders.
 
 The processor time of a reading is that of the service and its workers, without the database and the sender.
 """
@@ -490,7 +491,9 @@ def print_against(site: Site, seconds: float, tree: Path) -> None:
             )
 
 
-def print_fleet(site: Site, seconds: float, first: int, most: int, server: Server | None = None) -> None:
+def print_fleet(
+    site: Site, seconds: float, numbers: range, forms: Sequence[str], server: Server | None = None
+) -> None:
     """Print the number of meters that one process, or two workers, hold."""
     with tempfile.TemporaryDirectory() as folder:
 
@@ -499,9 +502,9 @@ def print_fleet(site: Site, seconds: float, first: int, most: int, server: Serve
             print(f"{lasting_s:.0f} s, {'held' if good else 'not held'}: {text}", flush=True)
             return good
 
-        for form in ("json", "arrow"):
-            best, number = first, first
-            while number <= most and held(form, number, min(RAMP_S, seconds)):
+        for form in forms:
+            best = number = numbers.start
+            while number in numbers and held(form, number, min(RAMP_S, seconds)):
                 best, number = number, max(number + 1, int(number * GROWTH))
             while seconds > RAMP_S and best > 1 and not held(form, best, seconds):
                 best = int(best * RETREAT)
@@ -514,19 +517,25 @@ TICK_MAX, SINGLES_MIN, BATCHES_MIN = 3.0, 0.2, 1e5
 
 def main() -> int:
     """Measure."""
-    asked = arguments(__doc__, seconds=20.0, most=200, first=FIRST, against="", costs=False, workers=False)
+    asked = arguments(
+        __doc__, seconds=20.0, most=200, first=FIRST, against="", costs=False, workers=False, arrow=False
+    )
     site = load(FEEDER)
     if asked.against:
         print_against(site, asked.seconds, Path(asked.against).resolve())
         return 0
+    forms = ("arrow",) if asked.arrow else ("json", "arrow")
     if asked.workers:
         with running_server(installed_postgresql()) as server:
-            print_fleet(site, asked.seconds, asked.first, asked.most, server)
+            print_fleet(site, asked.seconds, range(asked.first, asked.most + 1), forms, server)
+        return 0
+    if asked.arrow:
+        print_fleet(site, asked.seconds, range(asked.first, asked.most + 1), forms)
         return 0
     tick = print_stages(site)
     singles, batches = print_rates(site)
     if not asked.costs:
-        print_fleet(site, asked.seconds, asked.first, asked.most)
+        print_fleet(site, asked.seconds, range(asked.first, asked.most + 1), forms)
     return int(not (tick <= TICK_MAX and singles >= SINGLES_MIN and batches >= BATCHES_MIN))
 
 

@@ -35,7 +35,7 @@ from service.ingest.queues import (
 
 RING = 8192
 """Capacity of a subscription's queue, samples."""
-POLL_S = 0.01
+POLL_S = 0.02
 """Pause between two looks at the queues of single feeders, s.
 
 A thread that waits for one queue wakes ten times a second and takes the interpreter's lock: hundreds of them
