@@ -32,8 +32,11 @@ FLOOD = 2.0
 """Samples of each meter and tick from which a feeder is shed before all others."""
 CAPACITY_MIN = 0.1
 """Smallest capacity: a process that gets less cannot be helped by fewer feeders."""
-_SMOOTH = 0.3
-"""Weight of a new window in the mean costs."""
+_SMOOTH, _FALL = 0.3, 0.7
+"""Weights of a new window in the mean costs, and in that of a tick which costs less than before.
+
+The start of many feeders at once must not make their cost look large for long.
+"""
 
 
 @dataclass(slots=True)
@@ -46,6 +49,7 @@ class FeederLoad:
     spent_s: float = 0.0  # processor time of its ticks in this window, s
     ticks: int = 0  # its ticks in this window
     tick_cost_s: float = 0.0  # mean time of a tick, s
+    begun: bool = False  # its first tick since a start or a return, of another cost, is over
     offered: int = 0  # number of samples until this window
     rate: float = 0.0  # samples offered per second
 
@@ -96,10 +100,12 @@ class LoadControl:
         window.signs += lasted_s > LONG_ROUND_S
 
     def count_tick(self, feeder: str, spent_s: float) -> None:
-        """Add the processor time of a tick, s."""
+        """Add the processor time of a tick, s; the first one of a feeder does not count."""
         load = self.feeders[feeder]
-        load.spent_s += spent_s
-        load.ticks += 1
+        if load.begun:
+            load.spent_s += spent_s
+            load.ticks += 1
+        load.begun = feeder not in self.shed
 
     def count_losses(self, number: int) -> None:
         """Add samples or ticks that are lost by overload."""
@@ -160,8 +166,24 @@ class LoadControl:
             load.rate, load.offered = max(0, number - load.offered) / elapsed, number
             if load.ticks and name not in self.shed:
                 cost = load.spent_s / load.ticks
-                load.tick_cost_s += (_SMOOTH if load.tick_cost_s else 1.0) * (cost - load.tick_cost_s)
+                weight = _SMOOTH if cost > load.tick_cost_s else _FALL
+                load.tick_cost_s += (weight if load.tick_cost_s else 1.0) * (cost - load.tick_cost_s)
             load.spent_s, load.ticks = 0.0, 0
+        self._forget_costs()
+
+    def _forget_costs(self) -> None:
+        """Let the cost of shed feeders fall to the mean of the monitored ones, by their sources.
+
+        It is not measured while they are shed: one that was large for a short time would keep them out.
+        """
+        known = [one for name, one in self.feeders.items() if name not in self.shed and one.tick_cost_s > 0.0]
+        if not known:
+            return
+        each = sum(one.tick_cost_s for one in known) / sum(one.sources for one in known)
+        for name in self.shed:
+            load = self.feeders.get(name)
+            if load is not None:
+                load.tick_cost_s += _SMOOTH * min(0.0, each * load.sources - load.tick_cost_s)
 
     def _shed_more(self, kept: float, now: float) -> None:
         """Shed feeders: floods first, feeders with active alarms last. At least one stays."""

@@ -39,13 +39,7 @@ from gridsec.estimators.sequential import design as front_design
 from gridsec.estimators.sequential import init as front_init
 from gridsec.estimators.sequential import meter_bias
 from gridsec.estimators.sequential import state as front_state
-from gridsec.estimators.sequential.attack_kind import (
-    AttackKinds,
-    classify,
-    forget_readings,
-    ingest,
-    repeat_lags,
-)
+from gridsec.estimators.sequential.attack_kind import AttackKinds, classify, ingest, repeat_lags
 from gridsec.estimators.sequential.design import SequentialDesign, SequentialOptions
 from gridsec.estimators.sequential.device_checks import (
     BusbarTrust,
@@ -76,6 +70,7 @@ from gridsec.estimators.sequential.meter_bias import (
 )
 from gridsec.estimators.sequential.output import BoundInputs
 from gridsec.estimators.sequential.posterior import UNMETERED, LoadDoubt
+from gridsec.estimators.sequential.reading_history import forget_readings
 from gridsec.estimators.sequential.state import (
     ObserverRecord,
     Prediction,

@@ -11,7 +11,9 @@ Pipeline of `step`, by module:
     time_scales    running means of the residuals and their limits (detection)
     identify       likeliest sets of manipulated meters by search, hypotheses and device_checks; confirmation
                    by lasting evidence without a likely rival
-    attack_kind    kinds of the named manipulations, repeated readings
+    attack_kind    kinds of the named manipulations
+    reading_history
+                   repeated readings: stuck meters and replays
     output         estimate with bounds, verdict with reason
 
 `posterior` is the Gaussian model below all of them, `state` the memory between ticks, and `meter_bias`

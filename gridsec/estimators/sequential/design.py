@@ -17,7 +17,7 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible, NotObservable, Problem, raise_if_any
 from gridsec.estimators.detection import curve_mismatch
 from gridsec.estimators.plant import Plant, check_plant, judging_problems
-from gridsec.estimators.sequential.attack_kind import KindReferences, LoadTraces, look_interval, repeat_limits
+from gridsec.estimators.sequential.attack_kind import KindReferences, LoadTraces, look_interval
 from gridsec.estimators.sequential.posterior import (
     UNMETERED,
     LoadDoubt,
@@ -25,6 +25,7 @@ from gridsec.estimators.sequential.posterior import (
     injection_doubt,
     voltage_prior,
 )
+from gridsec.estimators.sequential.reading_history import repeat_limits
 from gridsec.estimators.sequential.search import Decoder, FaultDictionary
 from gridsec.grid.devices import ToldError, busbar_error, steady_rounding
 from gridsec.grid.network import Network, Power, Sensitivities

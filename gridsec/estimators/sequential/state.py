@@ -21,14 +21,7 @@ import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.estimators.plant import NO_VOLTAGE, Plant
-from gridsec.estimators.sequential.attack_kind import (
-    BLOCKS,
-    ROWS,
-    AttackKinds,
-    detection_readings,
-    forget_readings,
-    no_kinds,
-)
+from gridsec.estimators.sequential.attack_kind import AttackKinds, no_kinds
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.device_checks import BusbarTrust, InverterChecks, trusted_busbar
 from gridsec.estimators.sequential.device_checks import no_checks as no_curves
@@ -42,6 +35,7 @@ from gridsec.estimators.sequential.measurements import (
 from gridsec.estimators.sequential.meter_bias import Commission, Learned, Learning, initial
 from gridsec.estimators.sequential.meter_bias import renew as learn_anew
 from gridsec.estimators.sequential.posterior import DoubtedPowers, Posterior, VouchedPosterior
+from gridsec.estimators.sequential.reading_history import BLOCKS, ROWS, detection_readings, forget_readings
 from gridsec.estimators.sequential.time_scales import Window, empty, forget, min_readings
 from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.lure import Lure, LureTransition

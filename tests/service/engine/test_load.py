@@ -78,6 +78,34 @@ def test_feeders_are_shed_under_lasting_overload_and_return_at_once() -> None:
     assert not machine.shed
 
 
+def test_a_costly_start_of_all_feeders_does_not_keep_them_out() -> None:
+    """Ticks that cost twenty times as much for five seconds, then 0.6 of the processor's time."""
+    machine = Machine(100)
+    control = machine.control
+
+    def second(cost_s: float) -> None:
+        for name in machine.offered:
+            control.count_tick(name, cost_s if name not in machine.shed else 1e-5)
+        work = cost_s * (100 - len(machine.shed))
+        machine.t += 1.0
+        control.count_round(min(1.0, work), min(1.0, work), 0.0, min(1.0, work), 0)
+        control.count_losses(int(work > 1.0))
+        control.update(machine.offered)
+
+    for _ in range(5):
+        second(0.12)
+    assert 80 <= len(machine.shed) < 100
+    for _ in range(15):
+        second(0.006)
+    assert not machine.shed
+    # One costly tick of each feeder, as at the start of the service, sheds none.
+    machine = Machine(100)
+    control = machine.control
+    for cost_s in (0.05, *(0.006,) * 5):
+        second(cost_s)
+        assert not machine.shed
+
+
 def test_a_flood_is_shed_before_its_neighbours_and_alarms_last() -> None:
     machine = Machine(5)
     machine.control.feeders["f0"].standing = True

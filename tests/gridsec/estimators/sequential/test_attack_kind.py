@@ -19,14 +19,14 @@ from feeders.simulation.plant import MeterErrors
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Bias, Replay
-from gridsec.estimators.sequential import attack_kind
-from gridsec.estimators.sequential.attack_kind import (
+from gridsec.estimators.sequential import attack_kind, reading_history
+from gridsec.estimators.sequential.attack_kind import KindReferences
+from gridsec.estimators.sequential.reading_history import (
     BLOCKS,
     BYTES,
     ROWS,
     SPAN,
     Block,
-    KindReferences,
     ReadingHistory,
     RepeatLimits,
 )
@@ -40,17 +40,17 @@ SOON_S = {"stuck": 40.0, "replay": 40.0 + BLOCKS}
 
 def law(jitter: float = 5e-4, meters: int = 1) -> RepeatLimits:
     """Registers of 0.1 V."""
-    return attack_kind.repeat_limits(np.full(meters, STEP), np.full(meters, jitter), CHANCE, 1.0)
+    return reading_history.repeat_limits(np.full(meters, STEP), np.full(meters, jitter), CHANCE, 1.0)
 
 
 def play(rule: RepeatLimits, v: Floats, heard: Bools | None = None) -> list[ReadingHistory]:
     """All states while meters read v, (T, p) pu."""
     heard = np.ones(v.shape, dtype=np.bool_) if heard is None else heard
-    memory, out = attack_kind.no_history(v.shape[1]), []
+    memory, out = reading_history.no_history(v.shape[1]), []
     for row, available in zip(np.rint(v / rule.step) * rule.step, heard, strict=True):
-        listened = attack_kind.record_readings(rule, memory, np.where(available, row**2, 0.0), available)
+        listened = reading_history.record_readings(rule, memory, np.where(available, row**2, 0.0), available)
         out.append(listened)
-        memory = attack_kind.store(listened, row**2, 0.1 * row)
+        memory = reading_history.store(listened, row**2, 0.1 * row)
     return out
 
 
@@ -81,7 +81,7 @@ class TestRules:
         rule = law(0.0)
         assert rule.surprise[0] == 0.0
         still = np.ones((2000, 1))
-        assert not any(attack_kind.verified_lags(memory).any() for memory in play(rule, still))
+        assert not any(reading_history.verified_lags(memory).any() for memory in play(rule, still))
 
     def test_a_run_is_evidence_exactly_from_the_surprise_on(self) -> None:
         rule, rng = law(), np.random.default_rng(1)
@@ -132,7 +132,7 @@ class TestMemory:
             v[k] = v[k - lag]
         heard = rng.random((ticks, 1)) < 0.9
         heard[-1] = True
-        got = attack_kind.matching_readings(play(law(), v, heard)[-1], 0, lag, 500)
+        got = reading_history.matching_readings(play(law(), v, heard)[-1], 0, lag, 500)
         expected = 0
         for k in range(ticks - 1, lag - 1, -1):
             if heard[k, 0] and heard[k - lag, 0]:
@@ -160,19 +160,19 @@ class TestMemory:
                     break
                 same += 1
             expected = max(expected, same)
-        assert min(attack_kind.recurring(code), SPAN) == min(expected, SPAN)
+        assert min(reading_history.recurring(code), SPAN) == min(expected, SPAN)
 
     def test_very_many_meters_are_remembered_for_less_long(self) -> None:
         meters, ticks = 3000, ROWS * 18
-        memory, rng = attack_kind.no_history(meters), np.random.default_rng(2)
+        memory, rng = reading_history.no_history(meters), np.random.default_rng(2)
         rule = law(meters=meters)
         for _ in range(ticks):
-            memory = attack_kind.record_readings(
+            memory = reading_history.record_readings(
                 rule, memory, rng.random(meters), np.ones(meters, dtype=np.bool_)
             )
-            memory = attack_kind.store(memory, np.zeros(meters), np.zeros(meters))
+            memory = reading_history.store(memory, np.zeros(meters), np.zeros(meters))
         size = sum(held(block) for block in memory.blocks)
-        assert 0.8 * attack_kind.MOST_BYTES < size <= attack_kind.MOST_BYTES
+        assert 0.8 * reading_history.MOST_BYTES < size <= reading_history.MOST_BYTES
         assert memory.kept - memory.first <= size / (BYTES * meters) + ROWS
 
     def test_the_past_is_what_was_heard_and_no_longer_than_promised(self) -> None:
@@ -180,15 +180,15 @@ class TestMemory:
         ticks = ROWS * (BLOCKS + 2) + 17
         v, rule = noisy(rng, ticks, 2), law(meters=2)
         last = play(rule, v)[-1]
-        last = attack_kind.store(last, v[-1] ** 2, 0.1 * v[-1])
+        last = reading_history.store(last, v[-1] ** 2, 0.1 * v[-1])
         assert last.kept == ticks
         assert ROWS * BLOCKS <= last.kept - last.first <= ROWS * (BLOCKS + 1)
         for start, stop in ((last.first, ticks), (ticks - 5, ticks), (ticks - 100, ticks - 30)):
-            code, model = attack_kind.past(last, 1, start, stop)
+            code, model = reading_history.past(last, 1, start, stop)
             np.testing.assert_array_equal(code, np.rint(v[start:stop, 1] / rule.step[1]))
             read = np.rint(v[start : stop - 1, 1] / rule.step[1]) * rule.step[1]
             np.testing.assert_allclose(model[:-1][: read.size], read**2, rtol=1e-6, atol=0)
-            own = attack_kind.own_part(last, 1)[start - last.first : stop - last.first]
+            own = reading_history.own_part(last, 1)[start - last.first : stop - last.first]
             np.testing.assert_allclose(own[:-1][: read.size], 0.1 * read, rtol=1e-6, atol=0)
         kept = sum(held(block) for block in last.blocks)
         tail = ROWS * BYTES * 2
@@ -201,7 +201,7 @@ class TestMemory:
         for k in range(2200, 2600):
             v[k, 1] = v[k - lag, 1]
         states = play(law(meters=3), v)
-        found = [k for k, memory in enumerate(states) if attack_kind.verified_lags(memory)[1]]
+        found = [k for k, memory in enumerate(states) if reading_history.verified_lags(memory)[1]]
         assert found
         assert 2200 + SPAN - 1 <= found[0] <= 2200 + SPAN + BLOCKS + ROWS
         assert found == list(range(found[0], 2600))
@@ -217,27 +217,29 @@ class TestMemory:
         assert all(memory.lag[0] in {0, 1000} for memory in states)
 
     def test_absurd_readings_do_no_harm(self) -> None:
-        rule = attack_kind.repeat_limits(np.zeros(3), np.zeros(3), CHANCE, 1.0)
-        memory = attack_kind.no_history(3)
+        rule = reading_history.repeat_limits(np.zeros(3), np.zeros(3), CHANCE, 1.0)
+        memory = reading_history.no_history(3)
         for y in (-1.0, 0.0, 1e300, 1.0):
-            memory = attack_kind.record_readings(rule, memory, np.full(3, y), np.ones(3, dtype=np.bool_))
-            memory = attack_kind.store(memory, np.ones(3), np.zeros(3))
-        assert not attack_kind.verified_lags(memory).any()
+            memory = reading_history.record_readings(rule, memory, np.full(3, y), np.ones(3, dtype=np.bool_))
+            memory = reading_history.store(memory, np.ones(3), np.zeros(3))
+        assert not reading_history.verified_lags(memory).any()
 
 
 class TestHonestMeters:
     def test_at_the_worst_voltage_nothing_repeats_beyond_chance(self) -> None:
         """Every meter in the middle of a step, where repetition is likeliest: 2.9 million honest readings."""
         rng = np.random.default_rng(7)
-        rule = attack_kind.repeat_limits(np.full(146, STEP), np.full(146, 5e-4), 1.0 / (146 * 3.2e7 * 6), 1.0)
+        rule = reading_history.repeat_limits(
+            np.full(146, STEP), np.full(146, 5e-4), 1.0 / (146 * 3.2e7 * 6), 1.0
+        )
         v = np.rint(1.0 / STEP) * STEP + 5e-4 * rng.standard_normal((20_000, 146))
-        memory = attack_kind.no_history(146)
+        memory = reading_history.no_history(146)
         available = np.ones(146, dtype=np.bool_)
         for row in np.rint(v / STEP) * STEP:
-            memory = attack_kind.store(
-                attack_kind.record_readings(rule, memory, row**2, available), row**2, np.zeros(146)
+            memory = reading_history.store(
+                reading_history.record_readings(rule, memory, row**2, available), row**2, np.zeros(146)
             )
-            assert not attack_kind.verified_lags(memory).any()
+            assert not reading_history.verified_lags(memory).any()
         assert memory.longest.max() >= 8
 
     @pytest.mark.canary("0.3")
@@ -251,7 +253,7 @@ class TestHonestMeters:
             wander[k] = wander[k - 1] * (1.0 - 1.0 / 1800.0) + steps[k]
         v = 1.0 + wander + share * 5e-4 * rng.standard_normal(steps.shape)
         states = play(law(meters=20), v)
-        assert not any(attack_kind.verified_lags(memory).any() for memory in states)
+        assert not any(reading_history.verified_lags(memory).any() for memory in states)
         assert states[-1].longest.max() > 30
 
 
@@ -484,7 +486,9 @@ class TestTurns:
 def test_who_has_repeated_itself_is_a_replay_for_good() -> None:
     """Nothing of the past is asked: there is none."""
     shapes = cast("KindReferences", SimpleNamespace())
-    found = attack_kind._of_the_past(shapes, attack_kind.no_history(1), 0, 1.0, 32, ManipulationKind.REPLAY)
+    found = attack_kind._of_the_past(
+        shapes, reading_history.no_history(1), 0, 1.0, 32, ManipulationKind.REPLAY
+    )
     assert found is ManipulationKind.REPLAY
 
 
