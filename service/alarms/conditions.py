@@ -18,11 +18,11 @@ from service.report.report import (
     FeederReport,
     MeterState,
     StalledMeter,
-    Unread,
     device_name,
     finite,
     listed,
 )
+from service.report.tick_state import MeterCounts
 
 
 class AlarmKind(StrEnum):
@@ -113,14 +113,14 @@ def conditions(
     *,
     connecting: bool = False,
     keys: Collection[Key] | None = None,
-    unread: Unread | None = None,
+    counts: MeterCounts | None = None,
 ) -> list[Condition]:
     """Return the present and the unknown conditions of a feeder at one tick.
 
     connecting: a meter has had no reading since the start and is not silent yet.
     keys: conditions of meters that may be reported as unknown, those with an alarm or a pending one: an
         unknown condition has no other effect. None: all.
-    unread: numbers of all meters, for a report with some of them. None: those of the report.
+    counts: numbers of all meters, for a report with some of them. None: those of the report.
 
     - `meter-manipulated`: the verdict names the meter, or the busbar meter. Unknown while the verdict is
       UNDECIDED or the meter is unavailable, whatever the list of suspects; for the busbar meter also with an
@@ -142,11 +142,11 @@ def conditions(
 
     A condition that is not in the list is absent.
     """
-    if unread is None:
-        unread = Unread(len(report.meters), sum(not meter.seen for meter in report.meters))
+    if counts is None:
+        counts = MeterCounts(len(report.meters), sum(not meter.seen for meter in report.meters))
     manipulated = (*_manipulated(report, keys), *_busbar(report), *_inverters(report))
-    lost, undecided = _data_loss(report, keys, unread), _undecided(report, unread, connecting=connecting)
-    found = [*manipulated, *lost, *undecided, *_learning(report, unread.meters), *_clocks(report)]
+    lost, undecided = _data_loss(report, keys, counts), _undecided(report, counts, connecting=connecting)
+    found = [*manipulated, *lost, *undecided, *_learning(report, counts.total), *_clocks(report)]
     for meter in report.meters:
         found.extend(_voltage_limit(report, meter, keys))
     return found
@@ -291,13 +291,15 @@ def _voltage_limit(
     )
 
 
-def _data_loss(report: FeederReport, keys: Collection[Key] | None, unread: Unread) -> Iterable[Condition]:
+def _data_loss(
+    report: FeederReport, keys: Collection[Key] | None, counts: MeterCounts
+) -> Iterable[Condition]:
     silent = {one.meter: one.seconds for one in report.silent}
     owners = {meter.meter: meter.customer for meter in report.meters}
-    most = _most_silent(report, unread)
+    most = _most_silent(report, counts)
     if most:
-        yield _outage(report, most, unread.meters)
-    elif unread.mostly(unread.unread):
+        yield _outage(report, most, counts.total)
+    elif counts.mostly(counts.unread):
         # Most meters are unavailable, and not silent yet: an outage neither begins nor ends.
         yield Condition(AlarmKind.DATA_LOSS, report.feeder, None, Severity.MAJOR, known=False)
     unsure = [meter.meter for meter in report.meters if not meter.seen and meter.meter not in silent]
@@ -326,10 +328,10 @@ def _length(seconds: float | None) -> str:
     return "yet" if seconds is None else f"for {seconds:.0f} s"
 
 
-def _most_silent(report: FeederReport, unread: Unread) -> tuple[str, ...]:
+def _most_silent(report: FeederReport, counts: MeterCounts) -> tuple[str, ...]:
     """The silent meters of customers, if these are most of them."""
     silent = tuple(one.meter for one in report.silent if one.meter != BUSBAR)
-    return silent if unread.mostly(len(silent)) else ()
+    return silent if counts.mostly(len(silent)) else ()
 
 
 def _outage(report: FeederReport, silent: tuple[str, ...], meters: int) -> Condition:
@@ -347,15 +349,15 @@ def _outage(report: FeederReport, silent: tuple[str, ...], meters: int) -> Condi
     )
 
 
-def _undecided(report: FeederReport, unread: Unread, *, connecting: bool) -> Iterable[Condition]:
+def _undecided(report: FeederReport, counts: MeterCounts, *, connecting: bool) -> Iterable[Condition]:
     if report.verdict is not Decision.UNDECIDED:
         return
     unheard = report.cause in {Cause.SILENT_METERS, Cause.NO_BUSBAR}
     silent = {one.meter for one in report.silent}
     # A meter that is unavailable at every other tick is never silent; only this condition reports it.
-    told = report.cause is Cause.SILENT_METERS and 0 < unread.unread == len(silent - {BUSBAR})
+    told = report.cause is Cause.SILENT_METERS and 0 < counts.unread == len(silent - {BUSBAR})
     told = told or (report.cause is Cause.NO_BUSBAR and BUSBAR in silent)
-    told = told or (report.cause is Cause.TOO_FEW_METERS and bool(_most_silent(report, unread)))
+    told = told or (report.cause is Cause.TOO_FEW_METERS and bool(_most_silent(report, counts)))
     # Each of these meters has an alarm of kind `clock-offset`.
     told = told or report.cause is Cause.CLOCK_OFFSET
     yield Condition(

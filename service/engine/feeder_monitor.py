@@ -455,7 +455,7 @@ class FeederMonitor:
                 found = []
                 if notable is not None:
                     keys = book.entries.keys()
-                    found = conditions(notable, connecting=connecting, keys=keys, unread=state.unread)
+                    found = conditions(notable, connecting=connecting, keys=keys, counts=state.counts)
                 held = self._unmeasured(book, tick)
                 after, transitions = advance(book, self._alarm_rules, [*found, *mismatches, *held], state.t)
             except Exception as error:  # noqa: BLE001 - ticks before and after keep their verdicts

@@ -274,27 +274,6 @@ def _attack_volts(site: Site, reported: Floats, verdict: Verdict) -> Floats:
     return excess_volts(base, reported, verdict.busbar_attack, verdict.busbar)
 
 
-# --- Silence ---
-
-
-MOST_SILENT = 0.5
-"""Share of a feeder's meters beyond which their silence is one condition of the feeder."""
-FEW_METERS = 3
-"""Number of silent meters below which each one has its own condition."""
-
-
-@dataclass(frozen=True, slots=True)
-class Unread:
-    """Number of a feeder's meters, and of those without a usable reading."""
-
-    meters: int
-    unread: int
-
-    def mostly(self, count: int) -> bool:
-        """True if a number of meters is most of the feeder's."""
-        return count >= FEW_METERS and count > MOST_SILENT * self.meters
-
-
 # --- Reasons ---
 
 

@@ -26,7 +26,6 @@ from service.report.report import (
     LearningReport,
     ReferenceVoltages,
     Silence,
-    Unread,
     blind,
     build,
     busbar_report,
@@ -43,6 +42,27 @@ from service.report.report import (
     with_data_error,
     with_learning,
 )
+
+MOST_SILENT = 0.5
+"""Share of a feeder's meters beyond which their silence is one condition of the feeder."""
+FEW_METERS = 3
+"""Number of silent meters below which each one has its own condition."""
+
+
+@dataclass(frozen=True, slots=True)
+class MeterCounts:
+    """Numbers of a feeder's meters.
+
+    total: all meters of customers.
+    unread: those without a usable reading.
+    """
+
+    total: int
+    unread: int
+
+    def mostly(self, count: int) -> bool:
+        """True if a number of meters is most of the feeder's."""
+        return count >= FEW_METERS and count > MOST_SILENT * self.total
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +125,10 @@ class TickState:
         return int(np.count_nonzero(judgement.inverters & judged))
 
     @property
-    def unread(self) -> Unread:
+    def counts(self) -> MeterCounts:
         """Numbers of meters and of those without a usable reading."""
         seen = self.tick.seen
-        return Unread(seen.size, seen.size - int(np.count_nonzero(seen)))
+        return MeterCounts(seen.size, seen.size - int(np.count_nonzero(seen)))
 
     @property
     def model_only(self) -> bool:
@@ -254,7 +274,7 @@ class TickState:
         which = np.zeros(site.meters.size, dtype=np.bool_)
         # If most meters are silent, the outage is the only condition of those without an alarm.
         silent = {meter for meter, _ in self.tick.silent} - {None}
-        named = set(subjects) if self.unread.mostly(len(silent)) else silent.union(subjects)
+        named = set(subjects) if self.counts.mostly(len(silent)) else silent.union(subjects)
         if named - {None}:
             which |= np.array([meter in named for meter in site.meter_ids], dtype=np.bool_)
         if self.tick.clock_offset:

@@ -261,16 +261,15 @@ class Reader(IncidentReader):
 
     def rejected(self, limit: int = 100) -> list[Rejected]:
         """Return the newest rejected readings, newest first."""
-        b = BAD.c
-        query = sa.select(b.t, b.key, b.reason, b.payload).order_by(b.seq.desc()).limit(limit)
+        columns = (BAD.c.t, BAD.c.key, BAD.c.reason, BAD.c.payload)
+        query = sa.select(*columns).order_by(BAD.c.seq.desc()).limit(limit)
         with self._read() as connection:
             return [Rejected(*row) for row in connection.execute(query)]
 
     def feeders(self, names: Collection[str] | None = None) -> dict[str, dict[str, Any]]:
         """Return the tables of the feeders added over REST, or of those with these names, by name."""
-        query = sa.select(FEEDER.c.name, FEEDER.c.tables).order_by(FEEDER.c.name)
-        if names is not None:
-            query = query.where(FEEDER.c.name.in_(names))
+        chosen = sa.true() if names is None else FEEDER.c.name.in_(names)
+        query = sa.select(FEEDER.c.name, FEEDER.c.tables).where(chosen).order_by(FEEDER.c.name)
         with self._read() as connection:
             return {name: json.loads(tables) for name, tables in connection.execute(query)}
 

@@ -63,8 +63,8 @@ def test_alarms_are_those_of_whole_reports(site: Site, scene: str) -> None:
         state = result.state
         notable = state.notable({subject for _, subject in part.entries})
         calm += notable is None
-        keys, unread = part.entries.keys(), state.unread
-        some = [] if notable is None else conditions(notable, keys=keys, unread=unread)
+        keys, counts = part.entries.keys(), state.counts
+        some = [] if notable is None else conditions(notable, keys=keys, counts=counts)
         whole, expected = advance(whole, rules, conditions(state.report), state.t)
         part, transitions = advance(part, rules, some, state.t)
         assert transitions == expected
