@@ -559,7 +559,8 @@ class Engine:
             monitor.set_shed(name in shed)
             self._set_wake(monitor)
         self.metrics.shed.set(len(shed))
-        _log.warning("feeders are shed because of overload", feeders=len(shed), changed=changed[:SHOWN])
+        told = {"feeders": len(shed), "changed": changed[:SHOWN], **self.load.figures()}
+        _log.warning("feeders are shed because of overload", **told)
 
     def _reach(self, now: float, waiting: Mapping[str, float]) -> None:
         """Add the ticks that are due at the wall time `now`, Unix s, to the pending ones.

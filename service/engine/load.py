@@ -2,8 +2,8 @@
 
 The demand of a feeder is ``factor (c_s n + c_t / tick_s) / capacity``: seconds of a round for each second.
 n: samples offered per second. c_s: processor time of a sample. c_t: processor time of a tick. factor: that of
-everything else in a round. capacity: processor time of the rounds over their duration; other threads take the
-rest. Samples of a feeder that is not monitored are counted, so that its demand stays known.
+everything else in a round. capacity: part of the time in which no round waits for the processor, which other
+threads and processes have. Samples of a feeder that is not monitored are counted: its demand stays known.
 
 Under lasting overload whole feeders are shed until the demand of the others is `KEPT`. They return as
 soon as the demand of all fits again.
@@ -122,6 +122,17 @@ class LoadControl:
         cost = self._sample_cost_s * load.rate + load.tick_cost_s / load.tick_s
         return self._factor * cost / self._capacity
 
+    def figures(self) -> dict[str, float]:
+        """Return the demand of the monitored feeders and of all, and the measured parts of the model."""
+        all_of_them = {name: self.demand(name) for name in self.feeders}
+        figures = {
+            "demand": sum(value for name, value in all_of_them.items() if name not in self.shed),
+            "demand_of_all": sum(all_of_them.values()),
+            "factor": self._factor,
+            "capacity": self._capacity,
+        }
+        return {name: round(value, 2) for name, value in figures.items()}
+
     def update(self, offered: Mapping[str, int]) -> bool:
         """Decide at the end of a window; return True if `shed` has changed.
 
@@ -155,9 +166,9 @@ class LoadControl:
         if window.samples:
             cost = window.placed_s / window.samples
             self._sample_cost_s += (_SMOOTH if self._sample_cost_s else 1.0) * (cost - self._sample_cost_s)
-        if window.lasted_s > 0.0:
-            capacity = min(1.0, max(CAPACITY_MIN, window.rounds_s / window.lasted_s))
-            self._capacity += _SMOOTH * (capacity - self._capacity)
+        # Short rounds mostly wait for other threads, and yet the time between them is free.
+        waited = max(0.0, window.lasted_s - window.rounds_s) / elapsed
+        self._capacity += _SMOOTH * (max(CAPACITY_MIN, 1.0 - waited) - self._capacity)
         spent = window.placed_s + window.judged_s
         if spent > 0.0:
             self._factor = min(2.0, max(1.0, window.rounds_s / spent))

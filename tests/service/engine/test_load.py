@@ -146,6 +146,22 @@ def test_feeders_return_when_other_processes_end() -> None:
     assert not machine.shed
 
 
+def test_short_rounds_that_wait_for_other_threads_keep_no_feeder_out() -> None:
+    """With few feeders a round works 1 ms and waits 9 ms, five times a second: most of the time is free."""
+    machine = Machine(10)
+    for _ in range(4):
+        machine.second(150.0)
+    assert machine.shed
+    for _ in range(12):
+        for _ in range(5):
+            machine.control.count_round(0.01, 0.001, 0.0, 0.0, 0)
+        machine.second(50.0)
+    assert not machine.shed
+    figures = machine.control.figures()
+    assert figures["capacity"] > 0.9
+    assert figures["demand"] == figures["demand_of_all"] < KEPT
+
+
 def test_kept_demand_leaves_room() -> None:
     machine = Machine(20)
     for _ in range(10):
