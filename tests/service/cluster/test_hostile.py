@@ -72,7 +72,7 @@ def endured(live: ServedCluster, name: str, seconds: float) -> None:
     decided(live)
 
 
-@pytest.mark.canary("workers")
+@pytest.mark.canary("single")
 def test_1100_idle_connections(live: ServedCluster) -> None:
     endured(live, "connections", 3.0)
 
