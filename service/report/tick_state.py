@@ -191,7 +191,9 @@ class TickState:
         busbar = BUSBAR in subjects or tick.busbar_offset is not None
         busbar = busbar or (judgement is not None and bool(judgement.busbar.any()))
         decided = self.verdict is not Decision.UNDECIDED
-        nothing = not (meters.any() or inverters.any() or tick.silent or busbar)
+        # Meters may be unavailable and not silent: an alarm of the feeder's outage is then held.
+        outage = bool(tick.silent) or (None in subjects and self.counts.mostly(self.counts.unread))
+        nothing = not (meters.any() or inverters.any() or outage or busbar)
         if nothing and decided and learning is not None:
             return None
         report = replace(
@@ -272,10 +274,11 @@ class TickState:
         """Meters that a condition may depend on, (p,)."""
         site, judgement = self.site, self.judgement
         which = np.zeros(site.meters.size, dtype=np.bool_)
+        named, silent = set(subjects) - {None}, {meter for meter, _ in self.tick.silent} - {None}
         # If most meters are silent, the outage is the only condition of those without an alarm.
-        silent = {meter for meter, _ in self.tick.silent} - {None}
-        named = set(subjects) if self.counts.mostly(len(silent)) else silent.union(subjects)
-        if named - {None}:
+        if silent and not self.counts.mostly(len(silent)):
+            named |= silent
+        if named:
             which |= np.array([meter in named for meter in site.meter_ids], dtype=np.bool_)
         if self.tick.clock_offset:
             which |= np.array([offset is not None for offset in self.tick.clock_offset])

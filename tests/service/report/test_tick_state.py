@@ -12,7 +12,7 @@ from feeders.model.site import Site, load
 from feeders.simulation.attacks import Bias
 from feeders.simulation.scenario import Scenario, SimulatedReading, by_arrival, simulate
 from gridsec.interface import Decision
-from service.alarms.conditions import conditions
+from service.alarms.conditions import AlarmKind, conditions
 from service.alarms.state_machine import AlarmBook, AlarmRules, AlarmTransition, advance
 from service.engine.feeder_monitor import TickResult
 from service.engine.replay import ReplayCounts, replay
@@ -82,3 +82,18 @@ def test_alarms_are_those_of_whole_reports(site: Site, scene: str) -> None:
     assert bool(told) == (scene != "calm")
     assert calm > 10 or scene != "calm"
     assert Decision.CLEAN in {result.state.verdict for result in found}
+
+
+def test_an_outage_is_held_while_most_meters_are_unavailable_and_not_silent(site: Site) -> None:
+    """A decided tick after a time without monitoring, which is no evidence of silence."""
+    gone = dict.fromkeys(site.meter_ids[1:], (22.0, 45.0))
+    state = next(one.state for one in results(site, gone) if one.state.counts.mostly(one.state.counts.unread))
+    assert state.judgement is not None
+    decided = replace(state.judgement, decision=Decision.CLEAN)
+    state = replace(state, tick=replace(state.tick, silent=()), judgement=decided)
+    notable = state.notable({None})
+    assert notable is not None
+    keys = {(AlarmKind.DATA_LOSS, None)}
+    (found,) = (one for one in conditions(notable, keys=keys, counts=state.counts) if one.meter is None)
+    assert (found.kind, found.known) == (AlarmKind.DATA_LOSS, False)
+    assert found in conditions(state.report)
