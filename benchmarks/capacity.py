@@ -27,7 +27,7 @@ from pathlib import Path
 
 from benchmarks._arguments import arguments
 from benchmarks.fleet import FEEDER, OWN, WORKERS, puts, spent_s
-from benchmarks.overload import Service, metrics, running
+from benchmarks.overload import Service, metrics, renamed, running
 from feeders.format.tables import write
 from feeders.model.site import Site, load
 from feeders.simulation.scenario import Scenario, simulate
@@ -121,7 +121,7 @@ def cost(site: Site, feeders: int, tick_s: float, seconds: float, *, workers: bo
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gridsec-capacity-")))
         for name in names:
-            write(replace(tables, meta=replace(tables.meta, name=name)), folder / "feeders" / name)
+            write(renamed(tables, name), folder / "feeders" / name)
         database, place = None, folder / "state"
         place.mkdir()
         if workers:

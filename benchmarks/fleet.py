@@ -30,7 +30,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +39,7 @@ import zenoh
 from pyarrow import ipc
 
 from benchmarks._arguments import arguments
-from benchmarks.overload import START_S, Service, free_ports, metrics, running
+from benchmarks.overload import START_S, Service, free_ports, metrics, renamed, running
 from feeders.format.tables import to_json, write
 from feeders.model.site import Site, from_tables, load
 from feeders.registry import DesignedEstimator
@@ -160,7 +159,7 @@ def puts(name: str, readings: Sequence[SimulatedReading], t: float, form: str) -
 
 def copies(site: Site, names: Sequence[str]) -> list[Site]:
     """Return copies of a feeder with other names."""
-    return [from_tables(replace(site.tables, meta=replace(site.tables.meta, name=name))) for name in names]
+    return [from_tables(renamed(site.tables, name)) for name in names]
 
 
 # --- Stages ---
@@ -440,7 +439,7 @@ def holds(
     """True if that many feeders are held; processor time for a reading, s; a line of figures."""
     names = [f"feeder-{k:04d}" for k in range(number)]
     place = Path(tempfile.mkdtemp(prefix=f"{tree.name}-{form}-{number}-", dir=folder))
-    tables = {name: replace(site.tables, meta=replace(site.tables.meta, name=name)) for name in names}
+    tables = {name: renamed(site.tables, name) for name in names}
     workers, database, given = 0, None, names
     if server is None:
         for name, one in tables.items():

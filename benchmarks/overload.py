@@ -43,7 +43,7 @@ from pathlib import Path
 import httpx
 
 from benchmarks._arguments import arguments
-from feeders.format.tables import write
+from feeders.format.tables import FeederTables, write
 from feeders.model.site import Site, load
 from feeders.simulation.plant import BUSBAR
 from feeders.simulation.scenario import Scenario, simulate
@@ -250,6 +250,11 @@ def metrics(service: Service) -> Counter[str]:
     return found
 
 
+def renamed(tables: FeederTables, name: str) -> FeederTables:
+    """Return tables of a feeder with another name."""
+    return replace(tables, meta=replace(tables.meta, name=name))
+
+
 def stage(service: Service, sender: Sender, load: Load, rate: float, seconds: float) -> Stage:
     """Send at a rate and measure after `SETTLE_S`."""
     sender.rate = rate
@@ -388,7 +393,7 @@ def main() -> int:
             database = stack.enter_context(running_server(installed_postgresql())).database()
         for name in names:
             tables = site.tables
-            write(replace(tables, meta=replace(tables.meta, name=name)), folder / name)
+            write(renamed(tables, name), folder / name)
         said = load_of(site, names)
         measured = partial(measure, folder=folder, names=names, load=said, seconds=asked.seconds)
         before = measured(Path(asked.against).resolve(), database=database) if asked.against else None

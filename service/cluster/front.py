@@ -225,13 +225,12 @@ class Front:
 
     async def _put_one(self, name: str, site: Site) -> None:
         """Put one feeder until its owner takes or refuses it."""
-        tables = json.loads(json.dumps(to_json(site.tables)))
+        tables = to_json(site.tables)
+        ours = digest(tables)
         while True:
             entry = self._catalogue.feeders.get(name)
-            if entry is not None and entry.digest == digest(tables):
-                stored: bool | None = True
-            else:
-                stored = await self._put(name, tables)
+            same = entry is not None and entry.digest == ours
+            stored = True if same else await self._put(name, tables)
             if stored:
                 self._missing.discard(name)
             if stored is not None:

@@ -122,12 +122,15 @@ class LoadControl:
         cost = self._sample_cost_s * load.rate + load.tick_cost_s / load.tick_s
         return self._factor * cost / self._capacity
 
+    def _kept(self) -> float:
+        """Demand of the monitored feeders."""
+        return sum(self.demand(name) for name in self.feeders if name not in self.shed)
+
     def figures(self) -> dict[str, float]:
         """Return the demand of the monitored feeders and of all, and the measured parts of the model."""
-        all_of_them = {name: self.demand(name) for name in self.feeders}
         figures = {
-            "demand": sum(value for name, value in all_of_them.items() if name not in self.shed),
-            "demand_of_all": sum(all_of_them.values()),
+            "demand": self._kept(),
+            "demand_of_all": sum(self.demand(name) for name in self.feeders),
             "factor": self._factor,
             "capacity": self._capacity,
         }
@@ -147,7 +150,7 @@ class LoadControl:
         before = set(self.shed)
         for name in before - self.feeders.keys():
             del self.shed[name]
-        kept = sum(self.demand(name) for name in self.feeders if name not in self.shed)
+        kept = self._kept()
         heavy = window.signs > 0 and max(kept, window.lasted_s / elapsed) > OVERLOADED
         self._overloaded = self._overloaded + 1 if heavy else 0
         if heavy:

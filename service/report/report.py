@@ -256,8 +256,6 @@ def busbar_off(site: Site, tick: Tick, verdict: Verdict) -> str:
 
 def _furthest(which: Bools, off: Floats) -> int:
     """Phase with the largest deviation among the given ones, or among all if none is given."""
-    if which.size == 1:
-        return 0
     among = which if which.any() else np.ones_like(which)
     return int(np.where(among, np.nan_to_num(np.abs(off), nan=-0.5), -1.0).argmax())
 
