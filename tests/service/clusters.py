@@ -43,11 +43,11 @@ main()
 """
 """The command `gridsec` with a wall clock that the file of its first argument shifts."""
 ROUTER = """
-import sys
+import signal, sys
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import session
 with session(BusConfig("router", listen=(sys.argv[1],), connect=(sys.argv[2],))):
-    sys.stdin.read()
+    signal.pause()
 """
 """A zenoh router: listens on the first endpoint, and connects to the router of the second one."""
 NO_WORKERS = ("--workers", "0")
