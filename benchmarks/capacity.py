@@ -3,7 +3,7 @@
     python -m benchmarks.capacity [FEEDERS] [TICK_S] [SECONDS] [--workers]
 
 Feeders are copies of the Kerber suburban network, 146 meters and the busbar each. All meters of a feeder
-report in one batch in Arrow once in TICK_S; the feeders are spread over six tenths of it. The service is a
+report in one batch in Arrow once in TICK_S; the feeders are spread over three tenths of it. The service is a
 process of its own with SQLite, or a front with two workers and PostgreSQL.
 
 Cost model: cores, proportional set size of all processes, bytes/s of the database and bytes/s of the payloads
@@ -19,20 +19,16 @@ from __future__ import annotations
 import math
 import sys
 import tempfile
-import threading
 import time
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from benchmarks._arguments import arguments
-from benchmarks.fleet import FEEDER, OWN, WORKERS, puts, spent_s
+from benchmarks.fleet import FEEDER, OWN, WORKERS, Fleet, spent_s
 from benchmarks.overload import Service, metrics, renamed, running
 from feeders.format.tables import write
 from feeders.model.site import Site, load
-from feeders.simulation.scenario import Scenario, simulate
-from service.ingest.queues import BusConfig
-from service.ingest.zenoh_bus import MeterClient
 from tests.service.databases import installed_postgresql
 from tests.service.databases import running as running_server
 
@@ -40,15 +36,12 @@ LEAST = 64
 """Largest number of feeders of the small fleet."""
 WARM_TICKS = 4
 """Ticks before the measurement: the first report of all meters and the states after it."""
-SPREAD = 0.6
-"""Part of a tick over which the feeders report. The grace of a late reading is half a tick."""
 START_S = 900.0
 TARGET = 0.7
 """Load of a core that leaves room for restarts, late readings and other fluctuations."""
 MILLIONS = (1, 10, 30)
 TICKS_S = (1.0, 10.0, 60.0, 900.0)
 """Reporting intervals of the table, s."""
-SIMULATED = 10
 
 
 @dataclass(frozen=True)
@@ -64,34 +57,6 @@ class Cost:
     clean: float
     lost: float
     delay_s: float
-
-
-class Reports(threading.Thread):
-    """Publishes one batch of each feeder in every tick."""
-
-    def __init__(self, site: Site, names: list[str], zenoh: str, tick_s: float) -> None:
-        super().__init__(daemon=True)
-        seconds = simulate(site, Scenario(seed=1, duration_s=float(SIMULATED), dt_s=1.0))
-        self.samples = [second.readings for second in seconds]
-        self.names, self.zenoh, self.tick_s = names, zenoh, tick_s
-        self.sent = 0
-        self.ended = threading.Event()
-
-    def run(self) -> None:
-        """Publish."""
-        with MeterClient(BusConfig("client", connect=(self.zenoh,)), "gridsec") as meters:
-            number = math.floor(time.time() / self.tick_s) + 1
-            while not self.ended.is_set():
-                t, readings = number * self.tick_s, self.samples[number % SIMULATED]
-                for k, name in enumerate(self.names):
-                    if self.ended.wait(
-                        max(0.0, t + SPREAD * self.tick_s * k / len(self.names) - time.time())
-                    ):
-                        return
-                    for key, payload, kind in puts(name, readings, t, "arrow"):
-                        meters.put(key.removeprefix("gridsec/"), payload, kind)
-                        self.sent += len(key) + len(payload)
-                number += 1
 
 
 def memory(process: int) -> float:
@@ -139,7 +104,7 @@ def cost(site: Site, feeders: int, tick_s: float, seconds: float, *, workers: bo
             )
         )
         start_s = time.monotonic() - begun
-        reports = Reports(site, names, service.zenoh, tick_s)
+        reports = Fleet(site, names, "arrow", service.zenoh, tick_s=tick_s)
         reports.start()
         stack.callback(reports.join, 10.0)
         stack.callback(reports.ended.set)
@@ -148,7 +113,7 @@ def cost(site: Site, feeders: int, tick_s: float, seconds: float, *, workers: bo
 
 def _measured(  # noqa: PLR0917
     service: Service,
-    reports: Reports,
+    reports: Fleet,
     place: Path,
     feeders: int,
     tick_s: float,

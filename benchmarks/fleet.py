@@ -21,6 +21,7 @@ The processor time of a reading is that of the service and its workers, without 
 from __future__ import annotations
 
 import json
+import math
 import multiprocessing
 import os
 import sys
@@ -75,7 +76,8 @@ SENT = 60_000
 """Messages of the rates of zenoh."""
 SPREAD = 60
 """Feeders that these messages belong to."""
-SIMULATED = 60
+APART = 0.3
+"""Part of a tick over which the feeders report, below the grace of a late reading of half a tick."""
 LATE_S = 1.0
 """Age of a tick's result, s, from which it is late."""
 FIRST, GROWTH, RETREAT = 8, 1.5, 0.9
@@ -145,16 +147,17 @@ def batch(readings: Sequence[SimulatedReading], t: Sequence[float], form: str) -
     return bytes(sink.getvalue().to_pybytes())
 
 
-def puts(name: str, readings: Sequence[SimulatedReading], t: float, form: str) -> list[Put]:
-    """Return all puts of a feeder at one second."""
+def puts(readings: Sequence[SimulatedReading], t: float, form: str) -> list[Put]:
+    """Return all puts of a feeder at one second; the keys have no name of a feeder."""
     if form == "json":
-        return [(f"gridsec/{key_of(name, one.meter)}", single(one, t), FORMATS[form]) for one in readings]
+        return [(key_of("", one.meter), single(one, t), FORMATS[form]) for one in readings]
     meters = [one for one in readings if one.meter != BUSBAR]
     busbar = next(one for one in readings if one.meter == BUSBAR)
     payload = batch(meters, [t] * len(meters), form)
-    key = f"gridsec/{name}/concentrator/c1/readings"
-    busbar_key = f"gridsec/{key_of(name, BUSBAR)}"
-    return [(key, payload, FORMATS[form]), (busbar_key, single(busbar, t), FORMATS["json"])]
+    return [
+        ("/concentrator/c1/readings", payload, FORMATS[form]),
+        (key_of("", BUSBAR), single(busbar, t), FORMATS["json"]),
+    ]
 
 
 def copies(site: Site, names: Sequence[str]) -> list[Site]:
@@ -224,8 +227,14 @@ def stages(site: Site, form: str) -> dict[str, float]:
             if number == WARM:
                 spent.clear()
             now = second.t + 0.05
-            sent = [put for name in names for put in puts(name, second.readings, second.t, form)]
-            engine.cycle([Sample(key, payload, kind, now, len(payload)) for key, payload, kind in sent])
+            sent = puts(second.readings, second.t, form)
+            engine.cycle(
+                [
+                    Sample(f"gridsec/{name}{key}", payload, kind, now, len(payload))
+                    for name in names
+                    for key, payload, kind in sent
+                ]
+            )
     return {name: total / (TICKS * COPIES) for name, total in spent.items()}
 
 
@@ -376,32 +385,36 @@ def print_rates(site: Site) -> tuple[float, float]:
 
 
 class Fleet(threading.Thread):
-    """Publishes every meter of all feeders once a second, spread over the second."""
+    """Publishes every meter of all feeders once in `tick_s`; feeders follow each other within a part of it.
 
-    def __init__(self, site: Site, names: Sequence[str], form: str, endpoint: str) -> None:
+    All feeders have the readings of one simulation, which never repeats: a repeated error of a meter is a
+    systematic one, and would be found.
+    """
+
+    def __init__(
+        self, site: Site, names: Sequence[str], form: str, endpoint: str, *, tick_s: float = 1.0
+    ) -> None:
         super().__init__(daemon=True)
-        seconds = simulate(site, Scenario(seed=1, duration_s=float(SIMULATED), dt_s=1.0))
-        self.seconds = [second.readings for second in seconds]
-        self.names, self.form, self.endpoint = names, form, endpoint
-        self.behind_s = 0.0
+        self.seconds = simulate(site, Scenario(seed=1, duration_s=math.inf, dt_s=tick_s))
+        self.names, self.form, self.endpoint, self.tick_s = names, form, endpoint, tick_s
+        self.behind_s, self.sent = 0.0, 0
         self.ended = threading.Event()
 
     def run(self) -> None:
         """Publish."""
         with MeterClient(BusConfig("client", connect=(self.endpoint,)), "gridsec") as meters:
-            second = int(time.time()) + 1
-            while not self.ended.is_set():
-                time.sleep(max(0.0, second - time.time()))
-                # There and back again: a jump at the end would be a change of all feeders at once.
-                k = second % (2 * SIMULATED - 2)
-                readings = self.seconds[min(k, 2 * SIMULATED - 2 - k)]
-                for number, name in enumerate(self.names):
-                    # A feeder's meters report at once; feeders follow each other within 0.3 s.
-                    time.sleep(max(0.0, second + 0.3 * number / len(self.names) - time.time()))
-                    for key, payload, kind in puts(name, readings, float(second), self.form):
-                        meters.put(key.removeprefix("gridsec/"), payload, kind)
-                second += 1
-                self.behind_s = max(self.behind_s, time.time() - second)
+            begun = math.floor(time.time() / self.tick_s) + 1
+            for number, second in enumerate(self.seconds, begun):
+                t = number * self.tick_s
+                sent = puts(second.readings, t, self.form)
+                # A feeder's meters report at once.
+                for k, name in enumerate(self.names):
+                    if self.ended.wait(max(0.0, t + APART * self.tick_s * k / len(self.names) - time.time())):
+                        return
+                    for key, payload, kind in sent:
+                        meters.put(name + key, payload, kind)
+                        self.sent += len("gridsec/") + len(name) + len(key) + len(payload)
+                self.behind_s = max(self.behind_s, time.time() - t - self.tick_s)
 
 
 OWN = Path(__file__).parents[1]

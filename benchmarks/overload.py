@@ -66,6 +66,8 @@ DECIDED = 0.95
 """Share of the ticks due that have a verdict at a sustained rate."""
 JUDGED_EVERY_S = 5.0
 """Longest mean time between two judged ticks of a feeder during the overload, s."""
+PHASE = 0.9
+"""Part of a second at which a measurement begins and ends: between two ticks of 1 s."""
 START_S, STOP_S = 120.0, 10.0
 SECONDS = 60
 """Simulated seconds; the sender repeats them with other noise."""
@@ -255,18 +257,25 @@ def renamed(tables: FeederTables, name: str) -> FeederTables:
     return replace(tables, meta=replace(tables.meta, name=name))
 
 
+def await_phase() -> None:
+    """Wait until the next `PHASE` of a second."""
+    time.sleep((PHASE - time.time()) % 1.0)
+
+
 def stage(service: Service, sender: Sender, load: Load, rate: float, seconds: float) -> Stage:
-    """Send at a rate and measure after `SETTLE_S`."""
+    """Send at a rate and measure after `SETTLE_S`, over a whole number of ticks."""
     sender.rate = rate
     time.sleep(SETTLE_S)
+    await_phase()
     sent, before, begun = sender.sent, metrics(service), time.monotonic()
     seen = []
     while time.monotonic() < begun + seconds - SETTLE_S:
         time.sleep(0.5)
         seen.append(metrics(service)["gridsec_meters_seen"])
+    await_phase()
     after, lasted = metrics(service), time.monotonic() - begun
     more = after - before
-    due = lasted * service.feeders
+    due = round(lasted) * service.feeders
     decided = more["gridsec_ticks_total clean"] + more["gridsec_ticks_total attacked"]
     meters = service.feeders * (len(load.fields[0]) - 1)
     return Stage(
@@ -311,10 +320,10 @@ def observed(service: Service) -> Iterator[Shedding]:
         thread.join(30.0)
 
 
-def recovery(service: Service, names: Sequence[str], meters: int) -> float:
+def settling(service: Service, names: Sequence[str], meters: int, limit_s: float) -> float:
     """Time until every meter is seen and every verdict is CLEAN, s; infinite if beyond the limit."""
     begun = time.monotonic()
-    while time.monotonic() < begun + RECOVERY_S:
+    while time.monotonic() < begun + limit_s:
         feeders = {one["name"]: one for one in service.http.get("/api/v1/feeders").json()["feeders"]}
         clean = all(feeders[name].get("verdict") == "clean" for name in names)
         if clean and metrics(service)["gridsec_meters_seen"] == meters * len(names):
@@ -335,7 +344,8 @@ def measure(
         sender = Sender(load, service.zenoh, base)
         sender.start()
         try:
-            time.sleep(STAGE_S)
+            if settling(service, names, len(load.fields[0]) - 1, START_S) == float("inf"):
+                raise SystemExit("not every feeder is judged")
             sustained, share = 0.0, {} if workers else _totals(service)
             for number in range(STAGES):
                 found = stage(service, sender, load, base * GROWTH**number, STAGE_S)
@@ -349,7 +359,7 @@ def measure(
                 overload = stage(service, sender, load, OVERLOAD * max(sustained, base), seconds)
             _print(overload)
             sender.rate = base
-            recovery_s = recovery(service, names, len(load.fields[0]) - 1)
+            recovery_s = settling(service, names, len(load.fields[0]) - 1, RECOVERY_S)
         finally:
             sender.ended.set()
             sender.join(STOP_S)

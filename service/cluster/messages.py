@@ -6,7 +6,8 @@ message of one worker is not valid for another one. A message older than `FRESH_
 that of the database (`Leases.clock`): the clocks of the machines do not matter.
 
 State. A worker sends its leases and the entries of its feeders in the list on `@worker/<worker>/state`: after
-new ticks, at most every `GATHER_S`, and at least every `SILENT_S`. A feeder takes about 0.6 kB.
+new ticks, at most every `GATHER_S`, and at least every `SILENT_S`. A feeder takes about 0.6 kB. Messages of
+many feeders are rarer, up to `LONGEST_S`: they take at most `SHARE` of the time.
 
 REST. A request is one query on `@worker/<worker>/rest`. The worker executes it on its own HTTP application,
 in process, with the identity that the front has authenticated. No operation is declared twice.
@@ -88,7 +89,11 @@ class Envelope:
 GATHER_S: Final = 0.25
 """Shortest interval of the messages, s."""
 SILENT_S: Final = 0.5
-"""Longest interval of the messages, s."""
+"""Longest interval of the messages without new ticks, s."""
+LONGEST_S: Final = 1.0
+"""Longest interval of the messages of many feeders, s: a third of the time after which a worker is silent."""
+SHARE: Final = 0.03
+"""Part of the processor time of a thread for the messages."""
 STATES: Final = "@worker/*/state"
 """Keys of the messages of all workers, without the prefix."""
 
@@ -160,10 +165,12 @@ async def report_states(
     key = state_key(worker)
     while True:
         news.clear()
+        begun = time.thread_time()
         tell(key, envelope.seal(STATES, content()))
-        await asyncio.sleep(GATHER_S)
+        gather_s = min(max(GATHER_S, (time.thread_time() - begun) / SHARE), LONGEST_S)
+        await asyncio.sleep(gather_s)
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(news.wait(), SILENT_S - GATHER_S)
+            await asyncio.wait_for(news.wait(), max(SILENT_S - gather_s, 0.0))
 
 
 FORWARDED: Final = frozenset({"accept", "accept-encoding", "content-type", "if-none-match"})

@@ -7,6 +7,7 @@ After an upgrade, or a clock that was set back, they are added again, a bounded 
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -101,13 +102,15 @@ def _newest_rows(
 def add_rollups(
     connection: sa.Connection, upsert: Callable[..., Any], rolled: dict[str, float], report: Kept
 ) -> None:
-    """Add the roll-ups of the finished buckets before a stored report.
+    """Add the roll-ups of the finished buckets before a stored report, at most one bucket late.
+
+    Each feeder has its own delay: the work of many feeders is spread over the bucket.
 
     upsert: `Connections.upsert`.
     rolled: end of the roll-ups of each feeder, Unix s; updated.
     """
     h, r, feeder = HISTORY.c, ROLLUP.c, report.feeder
-    now = floor_to(report.t, ROLLUP_S)
+    now = floor_to(report.t - ROLLUP_S * _delay(feeder), ROLLUP_S)
     until = rolled.get(feeder)
     if until is None:
         until = _rolled_until(connection, feeder)
@@ -133,6 +136,11 @@ def add_rollups(
     for row in roll_up(connection.execute(query).all(), end):
         connection.execute(upsert(ROLLUP, "feeder", "t", "layout"), {"feeder": feeder, **row})
     rolled[feeder] = end
+
+
+def _delay(feeder: str) -> float:
+    """Delay of a feeder's roll-ups in buckets, [0, 1); it depends on the name only."""
+    return zlib.crc32(feeder.encode()) / 2.0**32
 
 
 def feeders_in(connection: sa.Connection, table: sa.Table) -> list[str]:

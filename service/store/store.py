@@ -778,9 +778,8 @@ class Store(Reader):
     ) -> None:
         found = [(report, report.row) for report in reports]
         layouts = self._layouts(connection, {row.meters for _, row in found})
-        put = self._connections.upsert(HISTORY, "feeder", "t")
-        for report, row in found:
-            values = {
+        rows = [
+            {
                 "feeder": report.feeder,
                 "t": report.t,
                 "verdict": str(report.verdict),
@@ -788,7 +787,11 @@ class Store(Reader):
                 "layout": layouts[row.meters],
                 "data": pack(row),
             }
-            connection.execute(put, values)
+            for report, row in found
+        ]
+        if rows:
+            connection.execute(self._connections.upsert(HISTORY, "feeder", "t"), rows)
+        for report in reports:
             self._prune(connection, report)
             add_rollups(connection, self._connections.upsert, rolled, report)
 

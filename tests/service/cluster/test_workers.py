@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import time
 from collections.abc import Iterator
-from itertools import count
+from itertools import count, pairwise
+from typing import Any
 
 import pytest
 
 from service.cluster import forward as module
 from service.cluster.forward import Workers
-from service.cluster.messages import STATES, Entry, Envelope, WorkerState
+from service.cluster.messages import (
+    GATHER_S,
+    LONGEST_S,
+    SHARE,
+    STATES,
+    Entry,
+    Envelope,
+    WorkerState,
+    report_states,
+)
 from service.store.leases import shard_of
 
 SHARD = shard_of("village")
@@ -107,3 +119,35 @@ def test_the_age_of_a_tick_includes_the_time_since_the_message() -> None:
     entry = heard.workers.entry("village")
     assert entry is not None
     assert 0.05 <= entry.now["age_s"] - 0.5 <= time.monotonic() - sent + 0.05
+
+
+@pytest.mark.parametrize(
+    ("cost_s", "interval_s"), [(0.0, GATHER_S), (0.02, 0.02 / SHARE), (0.2, LONGEST_S)], ids=str
+)
+def test_the_messages_of_many_feeders_are_rarer(cost_s: float, interval_s: float) -> None:
+    told: list[float] = []
+
+    def content() -> dict[str, Any]:
+        end = time.thread_time() + cost_s
+        while time.thread_time() < end:
+            pass
+        return {}
+
+    async def run() -> None:
+        news = asyncio.Event()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(3.0):
+                reports = report_states(
+                    content, lambda *_: told.append(time.monotonic()), "w0", Envelope(b""), news
+                )
+                task = asyncio.create_task(reports)
+                try:
+                    while True:
+                        news.set()
+                        await asyncio.sleep(0.01)
+                finally:
+                    task.cancel()
+
+    asyncio.run(run())
+    assert len(told) > 1
+    assert min(later - earlier for earlier, later in pairwise(told)) >= 0.95 * interval_s
