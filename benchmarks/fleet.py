@@ -86,10 +86,12 @@ RAMP_S = 20.0
 """Duration of a number during growth, s."""
 CLEAN_SHARE = 0.98
 """Share of ticks that are CLEAN where a fleet is held."""
+EDGE_S = 2.0
+"""Largest time by which the ticks of a measurement are fewer than its seconds, s: both ends cut one."""
 START_EACH_S = 0.5
 """Further time limit of the start for each feeder, s."""
-SETTLING_S = 120.0
-"""Time limit of the start until all feeders are CLEAN, s."""
+SETTLED_S, SETTLING_S = 10.0, 300.0
+"""Time in which nearly all ticks are CLEAN after the start, and limit of the start, s."""
 WORKERS = 2
 
 Put = tuple[str, bytes, str]
@@ -428,13 +430,19 @@ def spent_s(process: int) -> float:
     return own + sum(spent_s(int(one)) for one in children)
 
 
+def _ticks(found: Mapping[str, float]) -> float:
+    return sum(found[f"gridsec_ticks_total {verdict}"] for verdict in ("clean", "attacked", "undecided"))
+
+
 def _settle(service: Service, number: int) -> None:
     """Wait until nearly all ticks of a few seconds are CLEAN, or `SETTLING_S` are over."""
     end, before, begun = time.monotonic() + SETTLING_S, metrics(service), time.monotonic()
     while time.monotonic() < end:
-        time.sleep(4.0)
+        time.sleep(SETTLED_S)
         after, lasted = metrics(service), time.monotonic() - begun
-        if (after - before)["gridsec_ticks_total clean"] > CLEAN_SHARE * lasted * number:
+        more = after - before
+        complete = _ticks(more) > number * (lasted - EDGE_S)
+        if complete and more["gridsec_ticks_total clean"] > CLEAN_SHARE * _ticks(more):
             return
         before, begun = after, time.monotonic()
 
@@ -477,12 +485,14 @@ def holds(
             fleet.ended.set()
             fleet.join(10.0)
     more = after - before
-    clean = more["gridsec_ticks_total clean"] / (lasted * number)
+    clean, judged = more["gridsec_ticks_total clean"], _ticks(more)
     lost = more["gridsec_samples_dropped_total"] + more["gridsec_ticks_skipped_total"]
     delay = more["gridsec_report_delay_seconds_sum"] / max(1, more["gridsec_report_delay_seconds_count"])
     shed = after["gridsec_feeders_shed"]
-    held = clean > CLEAN_SHARE and lost == 0 and delay < LATE_S and shed == 0
-    text = f"{form} {number} feeders, {number * 147} sources: {clean:.3f} of the ticks clean, {lost:.0f} lost"
+    complete = judged > number * (lasted - EDGE_S)
+    held = complete and clean > CLEAN_SHARE * judged and lost == 0 and delay < LATE_S and shed == 0
+    share = f"{judged / number / lasted:.3f} ticks per second and feeder, {clean / judged:.3f} of them clean"
+    text = f"{form} {number} feeders, {number * 147} sources: {share}, {lost:.0f} lost"
     text += f", {shed:.0f} shed, mean delay {delay:.2f} s, sender behind by {max(0.0, fleet.behind_s):.2f} s"
     cost /= max(1.0, more["gridsec_readings_total"])
     return held, cost, f"{text}, {1e6 * cost:.1f} us for a reading"

@@ -591,6 +591,8 @@ class MeterClient:
         self._stack = ExitStack()
         self._live: zenoh.Session | None = None
         self._estimates: zenoh.handlers.Handler[zenoh.Sample] | None = None
+        # A router looks up the subscriptions of a declared key once; of another one with each payload.
+        self._publishers: dict[str, zenoh.Publisher] = {}
 
     def __enter__(self) -> MeterClient:
         """Open the session."""
@@ -600,6 +602,7 @@ class MeterClient:
     def __exit__(self, *_: object) -> None:
         """Close the session."""
         self._live = None
+        self._publishers.clear()
         self._stack.close()
 
     def watch(self, feeder: str) -> None:
@@ -635,13 +638,13 @@ class MeterClient:
     def put(self, key: str, payload: bytes, encoding: str = JSON) -> None:
         """Put a payload on a key (without the prefix). Raises BusUnavailable if the session is closed."""
         try:
-            # The default (drop when the network is congested) would lose readings of a simulation faster than
-            # real time; a meter with one reading per second is not affected.
-            self._session().put(
-                f"{self._prefix}/{key}",
-                payload,
-                encoding=encoding,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-            )
+            live = self._session()
+            if key not in self._publishers:
+                # The default (drop when the network is congested) would lose readings of a simulation faster
+                # than real time; a meter with one reading per second is not affected.
+                self._publishers[key] = live.declare_publisher(
+                    f"{self._prefix}/{key}", congestion_control=zenoh.CongestionControl.BLOCK
+                )
+            self._publishers[key].put(payload, encoding=encoding)
         except zenoh.ZError as error:
             raise BusUnavailable(f"zenoh put: {_first_line(error)}", code="put-failed") from error
