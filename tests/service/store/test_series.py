@@ -186,6 +186,27 @@ def test_old_roll_ups_are_deleted_with_their_rows(tmp_path: Path) -> None:
         assert oldest == store.history("village", limit=5000)[0]["t"]
 
 
+def test_the_roll_ups_of_many_feeders_are_spread_over_a_bucket(tmp_path: Path) -> None:
+    draw = np.random.default_rng(5)
+    names = [f"feeder-{k:03d}" for k in range(60)]
+    added: list[int] = []
+    with Store(f"sqlite:///{tmp_path}/g.db") as store:
+        for k in range(36):
+            made = a_report(BEGIN + 10.0 * k, draw)
+            store.commit(reports=[replace(made, feeder=name) for name in names])
+            with store._connections.read() as connection:
+                rolled = connection.execute(
+                    ROLLUP.select().with_only_columns(ROLLUP.c.feeder, ROLLUP.c.t)
+                ).all()
+            added.append(len(rolled))
+    first, later = np.diff(added[:24]), np.diff(added[24:])
+    assert not any(added[:12])
+    # Every feeder has its first roll-up at most one bucket late, and a second one a bucket after it.
+    assert {feeder for feeder, t in rolled if t == BEGIN} == set(names)
+    assert added[24] == len(names)
+    assert max(*first, *later) < len(names) / 4
+
+
 def test_the_cost_of_a_series_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without roll-ups the oldest rows are left out, and the series states it."""
     monkeypatch.setattr("service.store.rollups.MAX_ROWS", 50)
