@@ -5,7 +5,8 @@ every claim; a transaction of an earlier epoch is refused (`Leases.check`).
 
 A worker is absent when it has not renewed for `EXPIRY_S` by the database's clock, or when the session with
 its advisory lock has ended: the server ends it with the worker's process. Its shards are free after an
-absence of `GRACE_S`, within which a worker reconnects.
+absence of `GRACE_S`, within which a worker reconnects. After its own reconnection a worker leaves them alone
+for `RETURN_S`: no shard moves at the end of an outage of the database.
 
 Claims are serialised. Each free shard, the heaviest first, is due to the worker with the least weight; every
 worker claims its own. The worker with the largest weight releases shards (`excess`), one with feeders at a
@@ -15,6 +16,7 @@ time.
 from __future__ import annotations
 
 import hashlib
+import math
 import threading
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -40,6 +42,11 @@ EXPIRY_S: Final = 6.0
 """Time without a renewal after which a worker is absent, s."""
 GRACE_S: Final = 0.5
 """Absence after which the shards of a worker are free, s; above `POLL_S`, within which it reconnects."""
+RETURN_S: Final = 4.0
+"""Time after a reconnection in which no shard of an absent worker is free, s; above `RENEW_S`.
+
+The server may have been away for longer than `EXPIRY_S`; its workers reconnect and renew one after the other.
+"""
 SETTLE_S: Final = 2.0
 """Wait for further workers, s, while no live worker has a shard: all workers start at once."""
 CLOCK_S: Final = 30.0
@@ -139,6 +146,7 @@ class Leases:
         self._offset_s = 0.0  # Unix time of the database minus this process's monotonic time, s
         # Beginning of each absence in this process's monotonic time, s, within one session.
         self._absent: dict[int, float] = {}
+        self._returned = float("-inf")  # latest reconnection, monotonic s
         self._engine, self.name = _engine(database, self._connected)
         self._wait_s, self._limit_s = connect.LOCK_S, OPEN_S
         self._session: Timed | None = None
@@ -361,7 +369,8 @@ class Leases:
         now = time.monotonic()
         owners = {owner for _, owner in view.shards.values() if owner is not None}
         self._absent = {number: self._absent.get(number, now) for number in owners - view.live}
-        gone = {number for number, since in self._absent.items() if now - since >= GRACE_S}
+        absent_s = GRACE_S if now >= self._returned + RETURN_S else math.inf
+        gone = {number for number, since in self._absent.items() if now - since >= absent_s}
         plan = _Plan([], dict.fromkeys(sorted(view.live), 0))
         free = []
         for shard, (_, owner) in view.shards.items():
@@ -394,6 +403,8 @@ class Leases:
         except BaseException:
             made.close()
             raise
+        if self._session is not None:
+            self._returned = time.monotonic()
         self._session = made
         return made
 

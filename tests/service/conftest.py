@@ -59,6 +59,8 @@ PAGE_PATIENCE_MS = 30_000.0
 """Time limit of an expectation on a page, ms: that of actions, for machines with little processor time."""
 
 NOMINAL = 230.94
+STALE_S = 120.0
+"""Age at which a tick is stale, s: a busy machine opens a page within it."""
 
 
 class Village:
@@ -87,7 +89,7 @@ class Village:
             "v_min_volt": 0.9 * NOMINAL,
             "v_max_volt": 1.1 * NOMINAL,
             "tick_s": 1.0,
-            "patience_s": 5.0,
+            "patience_s": STALE_S,
             "layout": {"buses": self.buses, "parent": self.parent, "xy": None, "customers": self.customers},
             "tables": {"meta": {"name": self.name}, "lines": [], "customers": []},
         }

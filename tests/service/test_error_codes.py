@@ -360,7 +360,7 @@ def put_fails(_: Path, __: Patch) -> None:
         raise zenoh.ZError("the session is closed at /there")
 
     meters = MeterClient(BusConfig(), "gridsec")
-    meters._live = cast(Any, SimpleNamespace(put=put))
+    meters._live = cast(Any, SimpleNamespace(declare_publisher=lambda *_, **__: SimpleNamespace(put=put)))
     meters.put("key", b"")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import subprocess
 import sys
@@ -313,10 +314,32 @@ def test_a_restart_of_the_server_moves_no_shard(
         assert not first.fresh
     finally:
         cluster.start()
+    # The second worker reconnects later than the grace of an absence.
+    assert (first.renew(), first.claim()) == (set(), [])
+    time.sleep(1.2 * leases.GRACE_S)
+    assert first.claim() == []
     for worker in (first, second):
         assert (worker.renew(), worker.claim()) == (set(), [])
         assert worker.fresh
     assert (first.held, second.held) == before
+
+
+def test_absent_workers_lose_their_shards_after_a_restart_of_the_server(
+    cluster: Cluster, join: Join, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(leases, "EXPIRY_S", 0.4)
+    monkeypatch.setattr(leases, "RETURN_S", 1.0)
+    first, second = join("a"), join("b")
+    settle(first, second)
+    cluster.stop()
+    cluster.start()
+    with contextlib.suppress(StoreUnavailable):
+        first.renew()
+    assert first.renew() == set()
+    began = time.monotonic()
+    wait_for_all(first)
+    assert time.monotonic() - began > 0.9
+    assert second.renew()
 
 
 def test_the_shards_of_a_worker_without_a_session_are_claimed(url: str, join: Join) -> None:

@@ -486,7 +486,7 @@ def test_old_data_is_not_shown_as_an_answer(site: Site) -> None:
     page.clock.install()
     page.goto(site.server.url)
     expect(page.locator("#decision")).to_have_text("CLEAN")
-    page.clock.fast_forward(10_000)
+    page.clock.fast_forward(int(1_100 * site.village.detail()["patience_s"]))
     expect(page.locator("#link")).to_contain_text("data stale")
     expect(page.locator("#decision")).to_have_text("NO LIVE DATA")
     expect(page.locator("#verdict")).to_have_attribute("data-verdict", "none")
