@@ -151,6 +151,7 @@ def neighbours() -> Estimator:
     return family
 
 
+@pytest.mark.canary("landnetz")
 @pytest.mark.parametrize("make", [partial(load, "ieee-european-lv"), landnetz, european])
 def test_the_estimator_watches_three_phases_and_meshes(make: Callable[[], Site]) -> None:
     family, lie = neighbours(), AttackSpec(AttackKind.BIAS, count=1, size=6.0, onset_s=5.0)

@@ -9,8 +9,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
-from functools import cache
+from collections.abc import Callable, Iterator
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -53,34 +52,37 @@ def names(requirements: list[str]) -> set[str]:
     return out
 
 
-parsed = cache(ast.parse)
-
-
-def imported(source: str, *, at_once: bool) -> Iterator[str]:
-    """Names of the packages that a module imports: outside of functions only, or anywhere."""
-    waiting: list[ast.AST] = [parsed(source)]
+def imported(source: str) -> Iterator[tuple[str, bool]]:
+    """Packages that a module imports, and whether on its own import: outside of functions."""
+    waiting: list[tuple[ast.AST, bool]] = [(ast.parse(source), True)]
     while waiting:
-        node = waiting.pop()
+        node, at_once = waiting.pop()
         if isinstance(node, ast.Import):
-            yield from (each.name.partition(".")[0] for each in node.names)
+            yield from ((each.name.partition(".")[0], at_once) for each in node.names)
         elif isinstance(node, ast.ImportFrom) and not node.level:
-            yield str(node.module).partition(".")[0]
+            yield str(node.module).partition(".")[0], at_once
         elif isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
-            waiting += node.orelse
-        elif not (at_once and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)):
-            waiting += ast.iter_child_nodes(node)
+            waiting += ((each, at_once) for each in node.orelse)
+        elif not isinstance(node, ast.expr):  # no import within
+            at_once = at_once and not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+            waiting += ((each, at_once) for each in ast.iter_child_nodes(node))
 
 
-def foreign(owners: Mapping[str, list[str]], *, at_once: bool) -> set[str]:
-    """Distributions of all foreign packages that the project imports."""
-    found = {
-        name
+def foreign() -> tuple[set[str], set[str]]:
+    """Distributions of all foreign packages that the project imports: on the import of a module, or later."""
+    sources = (
+        path.read_text("utf-8")
         for package in ("gridsec", "feeders", "service")
         for path in (ROOT / package).rglob("*.py")
-        for name in imported(path.read_text("utf-8"), at_once=at_once)
-    }
-    ours = {"gridsec", "feeders", "service"}
-    return names([owners[name][0] for name in found - sys.stdlib_module_names - ours])
+    )
+    found = {one for source in sources for one in imported(source)}
+    owners, ours = packages_distributions(), {"gridsec", "feeders", "service"}
+
+    def of(which: bool) -> set[str]:
+        wanted = {name for name, at_once in found if at_once is which} - sys.stdlib_module_names - ours
+        return names([owners[name][0] for name in wanted])
+
+    return of(True), of(False)
 
 
 def test_the_lock_files_agree() -> None:
@@ -103,11 +105,10 @@ def test_the_lock_files_have_what_the_project_states() -> None:
 
 def test_modules_import_the_run_time_only() -> None:
     locked = {name for name, _ in pins(RUN_TIME)}
-    owners = packages_distributions()
-    found = foreign(owners, at_once=True)
+    found, later = foreign()
     assert len(found) > 10
     assert found <= locked
-    optional = foreign(owners, at_once=False) - locked
+    optional = later - locked
     assert {"pandapower", "simbench", "matplotlib"} <= optional <= names(["gridsec[convert,cluster,plot]"])
 
 
@@ -124,8 +125,7 @@ class G:
     def i(self):
         import j
 """
-    assert set(imported(source, at_once=True)) == {"b", "c", "g"}
-    assert set(imported(source, at_once=False)) == {"b", "c", "g", "j"}
+    assert set(imported(source)) == {("b", True), ("c", True), ("g", True), ("j", False)}
 
 
 def planned(folder: Path, target: str) -> list[str]:

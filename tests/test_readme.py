@@ -28,6 +28,7 @@ def test_the_python_example_names_the_liars() -> None:
     assert len(re.findall(r"2\d\d\.", voltages)) == 13
 
 
+@pytest.mark.acceptance
 def test_the_publishing_example_arrives(tmp_path: Path) -> None:
     with serve("simbench-lv-rural1", tmp_path, clock="wall") as live, Fleet(live) as fleet:
         code = PUBLISH.replace("7447", str(live.zenoh_port))

@@ -245,8 +245,8 @@ def run_lengths(model: ResidualModel, gamma: float, runs: int, seed: int) -> Flo
     return out
 
 
-@pytest.mark.canary("mixed-100.0-40")
-@pytest.mark.parametrize(("gamma", "runs"), [(100.0, 40), (1000.0, 12)])
+@pytest.mark.canary("mixed-30.0-40")
+@pytest.mark.parametrize(("gamma", "runs"), [(30.0, 40), (100.0, 40), (1000.0, 12)])
 @pytest.mark.parametrize("make", [busbar, mixed])
 def test_average_run_length_is_at_least_gamma(make: object, gamma: float, runs: int) -> None:
     """The mean of run lengths cut at 8 gamma, less 2.33 standard errors (99 %), is at least gamma."""
