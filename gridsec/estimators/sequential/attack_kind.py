@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 from scipy.special import chdtri
@@ -380,7 +380,7 @@ def _drifts(deviations: Floats, noise: Floats) -> Bools:
     return np.asarray(lasting & (np.sqrt(least / count) < _REMAINDER * np.abs(grown)))
 
 
-@cache
+@lru_cache(maxsize=4)  # up to 1 MB each
 def _ramps(n: int) -> tuple[Floats, Floats, Ints]:
     """All ramps from 0 to 1 over n bins, centred and of norm 1; their norms, and durations in bins."""
     begin, end = np.triu_indices(n, 1)
