@@ -92,6 +92,8 @@ EDGE_S = 2.0
 """Largest time by which the ticks of a measurement are fewer than its seconds, s: both ends cut one."""
 START_EACH_S = 0.5
 """Further time limit of the start for each feeder, s."""
+LOOK_S = 5.0
+"""Interval at which the shed feeders are counted, s."""
 SETTLED_S, SETTLING_S = 10.0, 300.0
 """Time in which nearly all ticks are CLEAN after the start, and limit of the start, s."""
 WORKERS = 2
@@ -436,6 +438,15 @@ def _ticks(found: Mapping[str, float]) -> float:
     return sum(found[f"gridsec_ticks_total {verdict}"] for verdict in ("clean", "attacked", "undecided"))
 
 
+def _most_shed(service: Service, end: float) -> int:
+    """Wait until a monotonic time, s; the largest number of shed feeders at any look."""
+    most = 0
+    while (left := end - time.monotonic()) > 0.0:
+        time.sleep(min(LOOK_S, left))
+        most = max(most, int(metrics(service)["gridsec_feeders_shed"]))
+    return most
+
+
 def _settle(service: Service, number: int) -> None:
     """Wait until nearly all ticks of a few seconds are CLEAN, or `SETTLING_S` are over."""
     end, before, begun = time.monotonic() + SETTLING_S, metrics(service), time.monotonic()
@@ -480,7 +491,7 @@ def holds(
             _settle(service, number)
             fleet.behind_s = 0.0
             before, begun, spent = metrics(service), time.monotonic(), spent_s(service.process.pid)
-            time.sleep(seconds)
+            most = _most_shed(service, begun + seconds)
             cost = spent_s(service.process.pid) - spent
             after, lasted = metrics(service), time.monotonic() - begun
         finally:
@@ -493,9 +504,12 @@ def holds(
     shed = after["gridsec_feeders_shed"]
     complete = judged > number * (lasted - EDGE_S)
     held = complete and clean > CLEAN_SHARE * judged and lost == 0 and delay < LATE_S and shed == 0
-    share = f"{judged / number / lasted:.3f} ticks per second and feeder, {clean / judged:.3f} of them clean"
-    text = f"{form} {number} feeders, {number * 147} sources: {share}, {lost:.0f} lost"
-    text += f", {shed:.0f} shed, mean delay {delay:.2f} s, sender behind by {max(0.0, fleet.behind_s):.2f} s"
+    rate, share = judged / number / lasted, clean / max(1.0, judged)
+    text = f"{form} {number} feeders, {number * 147} sources: {rate:.3f} ticks per second and feeder"
+    text += (
+        f", {share:.3f} of them clean, {lost:.0f} lost, at most {most} shed at a look, {shed:.0f} at the end"
+    )
+    text += f", mean delay {delay:.2f} s, sender behind by {max(0.0, fleet.behind_s):.2f} s"
     cost /= max(1.0, more["gridsec_readings_total"])
     return held, cost, f"{text}, {1e6 * cost:.1f} us for a reading"
 

@@ -267,19 +267,20 @@ def stage(service: Service, sender: Sender, load: Load, rate: float, seconds: fl
     sender.rate = rate
     time.sleep(SETTLE_S)
     await_phase()
-    sent, before, begun = sender.sent, metrics(service), time.monotonic()
+    begun, sent = time.monotonic(), sender.sent
+    before = metrics(service)
     seen = []
     while time.monotonic() < begun + seconds - SETTLE_S:
         time.sleep(0.5)
         seen.append(metrics(service)["gridsec_meters_seen"])
     await_phase()
-    after, lasted = metrics(service), time.monotonic() - begun
-    more = after - before
+    lasted, sent = time.monotonic() - begun, sender.sent - sent
+    more = metrics(service) - before
     due = round(lasted) * service.feeders
     decided = more["gridsec_ticks_total clean"] + more["gridsec_ticks_total attacked"]
     meters = service.feeders * (len(load.fields[0]) - 1)
     return Stage(
-        (sender.sent - sent) / lasted,
+        sent / lasted,
         more["gridsec_readings_total"] / lasted,
         (decided + more["gridsec_ticks_total undecided"]) / due,
         decided / due,

@@ -90,8 +90,8 @@ GATHER_S: Final = 0.25
 """Shortest interval of the messages, s."""
 SILENT_S: Final = 0.5
 """Longest interval of the messages without new ticks, s."""
-LONGEST_S: Final = 1.0
-"""Longest interval of the messages of many feeders, s: a third of the time after which a worker is silent."""
+LONGEST_S: Final = 0.75
+"""Longest interval of the messages of many feeders, s: a worker is silent after four of them."""
 SHARE: Final = 0.03
 """Part of the processor time of a thread for the messages."""
 STATES: Final = "@worker/*/state"

@@ -262,7 +262,6 @@ class Member:
         if self.problem is not None:
             _log.info("the leases can be used again")
             self.problem = None
-            self._renew.set()  # The leases may have expired meanwhile.
         return found
 
     @staticmethod

@@ -578,6 +578,14 @@ def _try_recv(handler: zenoh.handlers.Handler[zenoh.Sample]) -> zenoh.Sample | N
         return None
 
 
+DECLARED = 2_000
+"""Largest number of keys that a session of virtual meters declares.
+
+A router looks up the subscriptions of a declared key once, of another one with each payload. The time of a
+declaration grows with the number of declared keys.
+"""
+
+
 class MeterClient:
     """zenoh session of the virtual meters: puts readings and, on request, receives estimates.
 
@@ -591,7 +599,6 @@ class MeterClient:
         self._stack = ExitStack()
         self._live: zenoh.Session | None = None
         self._estimates: zenoh.handlers.Handler[zenoh.Sample] | None = None
-        # A router looks up the subscriptions of a declared key once; of another one with each payload.
         self._publishers: dict[str, zenoh.Publisher] = {}
 
     def __enter__(self) -> MeterClient:
@@ -638,13 +645,16 @@ class MeterClient:
     def put(self, key: str, payload: bytes, encoding: str = JSON) -> None:
         """Put a payload on a key (without the prefix). Raises BusUnavailable if the session is closed."""
         try:
-            live = self._session()
-            if key not in self._publishers:
-                # The default (drop when the network is congested) would lose readings of a simulation faster
-                # than real time; a meter with one reading per second is not affected.
-                self._publishers[key] = live.declare_publisher(
-                    f"{self._prefix}/{key}", congestion_control=zenoh.CongestionControl.BLOCK
-                )
-            self._publishers[key].put(payload, encoding=encoding)
+            live, publisher = self._session(), self._publishers.get(key)
+            # The default (drop when the network is congested) would lose readings of a simulation faster
+            # than real time; a meter with one reading per second is not affected.
+            block = zenoh.CongestionControl.BLOCK
+            if publisher is None and len(self._publishers) >= DECLARED:
+                live.put(f"{self._prefix}/{key}", payload, encoding=encoding, congestion_control=block)
+                return
+            if publisher is None:
+                publisher = live.declare_publisher(f"{self._prefix}/{key}", congestion_control=block)
+                self._publishers[key] = publisher
+            publisher.put(payload, encoding=encoding)
         except zenoh.ZError as error:
             raise BusUnavailable(f"zenoh put: {_first_line(error)}", code="put-failed") from error

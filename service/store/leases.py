@@ -42,10 +42,11 @@ EXPIRY_S: Final = 6.0
 """Time without a renewal after which a worker is absent, s."""
 GRACE_S: Final = 0.5
 """Absence after which the shards of a worker are free, s; above `POLL_S`, within which it reconnects."""
-RETURN_S: Final = 4.0
-"""Time after a reconnection in which no shard of an absent worker is free, s; above `RENEW_S`.
+RETURN_S: Final = CALL_S + RENEW_S
+"""Time after a reconnection in which no shard of an absent worker is free, s.
 
-The server may have been away for longer than `EXPIRY_S`; its workers reconnect and renew one after the other.
+The server may have been away for longer than `EXPIRY_S`. Another worker may wait for it for `CALL_S`, and
+renews at the latest `RENEW_S` later.
 """
 SETTLE_S: Final = 2.0
 """Wait for further workers, s, while no live worker has a shard: all workers start at once."""
@@ -403,8 +404,10 @@ class Leases:
         except BaseException:
             made.close()
             raise
-        if self._session is not None:
-            self._returned = time.monotonic()
+        now = time.monotonic()
+        # A session that ends again and again must not keep this worker from its part.
+        if self._session is not None and now >= self._returned + 2.0 * RETURN_S:
+            self._returned = now
         self._session = made
         return made
 
