@@ -6,8 +6,6 @@ BIN    := $(VENV)/bin
 # The observers are memory-bound; more BLAS threads only fight with each other.
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
-# Tests of services and pages wait for a fifth of their time: one process more than cores.
-PROCESSES ?= $(shell echo $$(($$(nproc 2>/dev/null || echo 2) + 1)))
 # The demo compiles the modules that it imports. All modules of the run time take 12 s and 130 MB more.
 # A lock file names every package. Resolving it again would let a release of a later day break the installation.
 INSTALL := $(BIN)/python -m pip install --no-deps --no-compile --quiet --disable-pip-version-check
@@ -21,13 +19,13 @@ demo: $(VENV)/.installed-demo
 
 test: $(VENV)/.installed
 	$(MAKE) --jobs --output-sync check
-	$(BIN)/python -m pytest -n $(PROCESSES) -m "not acceptance"
+	$(BIN)/python -m pytest -n auto -m "not acceptance"
 
 # All tests. Coverage is traced here only: tracing takes a quarter of the time on Python 3.11.
 acceptance: $(VENV)/.installed
 	$(MAKE) --jobs --output-sync check
 	$(BIN)/python -m coverage erase
-	$(BIN)/python -m pytest -n $(PROCESSES) --cov --cov-report=
+	$(BIN)/python -m pytest -n auto --cov --cov-report=
 	$(BIN)/python -m coverage report --fail-under=95
 
 check: lint types imports
