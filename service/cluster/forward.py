@@ -45,6 +45,8 @@ from service.store import OutcomeUnknown
 from service.store.leases import shard_of
 from service.store.store import Reader
 
+TELL_S: Final = 10.0
+"""Shortest interval of log lines about refused messages, s."""
 HEARD_S: Final = 3.0
 """Age of a worker's last message after which it is silent, s."""
 FORGET_S: Final = 3600.0
@@ -70,13 +72,14 @@ class Workers:
         self._lock = threading.Lock()
         self._heard: dict[str, _Heard] = {}
         self._owners: dict[int, tuple[int, str]] = {}
+        self._refused, self._tell_at = 0, float("-inf")
 
     def take(self, payload: bytes) -> None:
         """Take a message."""
         try:
             state = WorkerState.of(self._envelope.open(STATES, payload))
         except (MessageRefused, ValueError, KeyError, TypeError) as error:
-            _log.warning("a message of a worker is refused", problem=str(error))
+            self._refuse(str(error))
             return
         now = time.monotonic()
         with self._lock:
@@ -90,6 +93,13 @@ class Workers:
                 if epoch >= self._owners.get(shard, (0, ""))[0]:
                     self._owners[shard] = (epoch, state.worker)
         self.changed()
+
+    def _refuse(self, problem: str) -> None:
+        """Count a refused message, with a line of the log every `TELL_S`."""
+        self._refused += 1
+        if time.monotonic() >= self._tell_at:
+            _log.warning("messages of workers are refused", messages=self._refused, latest=problem)
+            self._refused, self._tell_at = 0, time.monotonic() + TELL_S
 
     def states(self) -> list[WorkerState]:
         """Latest states of the workers that are not silent."""

@@ -9,6 +9,7 @@ from itertools import count, pairwise
 from typing import Any
 
 import pytest
+from structlog.testing import capture_logs
 
 from service.cluster import forward as module
 from service.cluster.forward import Workers
@@ -118,6 +119,16 @@ def test_the_age_of_a_tick_includes_the_time_since_the_message() -> None:
     entry = heard.workers.entry("village")
     assert entry is not None
     assert 0.05 <= entry.now["age_s"] - 0.5 <= time.monotonic() - sent + 0.05
+
+
+def test_a_flood_of_forged_messages_has_one_line_of_the_log() -> None:
+    heard = Heard()
+    with capture_logs() as lines:
+        for _ in range(1000):
+            heard.workers.take(b"0" * 200)
+        heard.workers.take(heard.message("w0", 1))
+    assert [(line["messages"], line["log_level"]) for line in lines] == [(1, "warning")]
+    assert heard.owner() == ("w0", 1)
 
 
 @pytest.mark.parametrize(
