@@ -11,11 +11,10 @@ Feeders are copies of the Kerber suburban network, 146 meters and the busbar eac
 3. Fleet: the service is a process of its own, or with --workers a front with two workers on PostgreSQL. This
    process publishes each meter once a second. A fleet is held when no tick is missing but for two seconds at
    the ends, 98 % of the ticks are CLEAN, nothing is lost, the mean delay is less than 1 s, and at the end no
-   feeder is shed. The number of feeders grows by half from FIRST to MOST, for
-   20 s each, until a tick is late, a payload is lost or a feeder is shed. The last number is then watched for
-   SECONDS, and a tenth fewer until it is held. With --costs this part is left out, with --arrow all but
-   batches in Arrow. With another source tree only the processor time of a reading is compared,
-   with 8 feeders.
+   feeder is shed. The number of feeders grows by half from FIRST to MOST, for 20 s each, until it is not
+   held. The last number is then watched for SECONDS, and a tenth fewer until it is held. With --costs this
+   part is left out, with --arrow all but batches in Arrow. With another source tree only the processor time
+   of a reading is compared, with 8 feeders.
 
 The processor time of a reading is that of the service and its workers, without the database and the sender.
 """
@@ -42,7 +41,7 @@ import zenoh
 from pyarrow import ipc
 
 from benchmarks._arguments import arguments
-from benchmarks.overload import START_S, Service, free_ports, metrics, renamed, running
+from benchmarks.overload import START_S, Service, free_ports, metrics, renamed, running, ticks
 from feeders.format.tables import to_json, write
 from feeders.model.site import Site, from_tables, load
 from feeders.registry import DesignedEstimator
@@ -434,10 +433,6 @@ def spent_s(process: int) -> float:
     return own + sum(spent_s(int(one)) for one in children)
 
 
-def _ticks(found: Mapping[str, float]) -> float:
-    return sum(found[f"gridsec_ticks_total {verdict}"] for verdict in ("clean", "attacked", "undecided"))
-
-
 def _most_shed(service: Service, end: float) -> int:
     """Wait until a monotonic time, s; the largest number of shed feeders at any look."""
     most = 0
@@ -454,8 +449,8 @@ def _settle(service: Service, number: int) -> None:
         time.sleep(SETTLED_S)
         after, lasted = metrics(service), time.monotonic() - begun
         more = after - before
-        complete = _ticks(more) > number * (lasted - EDGE_S)
-        if complete and more["gridsec_ticks_total clean"] > CLEAN_SHARE * _ticks(more):
+        complete = ticks(more) > number * (lasted - EDGE_S)
+        if complete and more["gridsec_ticks_total clean"] > CLEAN_SHARE * ticks(more):
             return
         before, begun = after, time.monotonic()
 
@@ -498,7 +493,7 @@ def holds(
             fleet.ended.set()
             fleet.join(10.0)
     more = after - before
-    clean, judged = more["gridsec_ticks_total clean"], _ticks(more)
+    clean, judged = more["gridsec_ticks_total clean"], ticks(more)
     lost = more["gridsec_samples_dropped_total"] + more["gridsec_ticks_skipped_total"]
     delay = more["gridsec_report_delay_seconds_sum"] / max(1, more["gridsec_report_delay_seconds_count"])
     shed = after["gridsec_feeders_shed"]

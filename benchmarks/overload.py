@@ -33,7 +33,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -252,6 +252,11 @@ def metrics(service: Service) -> Counter[str]:
     return found
 
 
+def ticks(found: Mapping[str, float]) -> float:
+    """Number of ticks of all verdicts in `metrics`."""
+    return sum(found[f"gridsec_ticks_total {verdict}"] for verdict in ("clean", "attacked", "undecided"))
+
+
 def renamed(tables: FeederTables, name: str) -> FeederTables:
     """Return tables of a feeder with another name."""
     return replace(tables, meta=replace(tables.meta, name=name))
@@ -282,7 +287,7 @@ def stage(service: Service, sender: Sender, load: Load, rate: float, seconds: fl
     return Stage(
         sent / lasted,
         more["gridsec_readings_total"] / lasted,
-        (decided + more["gridsec_ticks_total undecided"]) / due,
+        ticks(more) / due,
         decided / due,
         sum(seen) / len(seen) / meters,
     )

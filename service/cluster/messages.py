@@ -7,7 +7,7 @@ that of the database (`Leases.clock`): the clocks of the machines do not matter.
 
 State. A worker sends its leases and the entries of its feeders in the list on `@worker/<worker>/state`: after
 new ticks, at most every `GATHER_S`, and at least every `SILENT_S`. A feeder takes about 0.6 kB. Messages of
-many feeders are rarer, up to `LONGEST_S`: they take at most `SHARE` of the time.
+many feeders are rarer, up to `LONGEST_S`, so that they take about `SHARE` of the time.
 
 REST. A request is one query on `@worker/<worker>/rest`. The worker executes it on its own HTTP application,
 in process, with the identity that the front has authenticated. No operation is declared twice.

@@ -645,16 +645,16 @@ class MeterClient:
     def put(self, key: str, payload: bytes, encoding: str = JSON) -> None:
         """Put a payload on a key (without the prefix). Raises BusUnavailable if the session is closed."""
         try:
-            live, publisher = self._session(), self._publishers.get(key)
+            live, publisher, full_key = self._session(), self._publishers.get(key), f"{self._prefix}/{key}"
             # The default (drop when the network is congested) would lose readings of a simulation faster
             # than real time; a meter with one reading per second is not affected.
             block = zenoh.CongestionControl.BLOCK
-            if publisher is None and len(self._publishers) >= DECLARED:
-                live.put(f"{self._prefix}/{key}", payload, encoding=encoding, congestion_control=block)
-                return
-            if publisher is None:
-                publisher = live.declare_publisher(f"{self._prefix}/{key}", congestion_control=block)
+            if publisher is None and len(self._publishers) < DECLARED:
+                publisher = live.declare_publisher(full_key, congestion_control=block)
                 self._publishers[key] = publisher
-            publisher.put(payload, encoding=encoding)
+            if publisher is None:
+                live.put(full_key, payload, encoding=encoding, congestion_control=block)
+            else:
+                publisher.put(payload, encoding=encoding)
         except zenoh.ZError as error:
             raise BusUnavailable(f"zenoh put: {_first_line(error)}", code="put-failed") from error

@@ -1,4 +1,4 @@
-"""Series and spans of alarms from the database, and the roll-ups of the history.
+"""Series and spans of alarms from the database, and the layouts and roll-ups of the history.
 
 Roll-ups are added in order of time: all rows of a feeder before the end of its newest roll-up are rolled up.
 After an upgrade, or a clock that was set back, they are added again, a bounded number with each stored row.
@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Final
 
 import sqlalchemy as sa
@@ -17,7 +18,7 @@ import sqlalchemy as sa
 from service.alarms.conditions import AlarmKind, Condition, Severity
 from service.alarms.state_machine import Alarm, Change, alarm_id, from_json
 from service.report.report import Kept
-from service.store.schema import ALARM, EVENT, HISTORY, LAYOUT, ROLLUP
+from service.store.schema import ALARM, EVENT, HISTORY, LAYOUT, ROLLUP, digest
 from service.store.series import (
     MAX_ROWS,
     ROLLUP_S,
@@ -94,6 +95,35 @@ def _newest_rows(
     texts = connection.execute(sa.select(LAYOUT.c.id, LAYOUT.c.meters).where(LAYOUT.c.id.in_(numbers)))
     meters = {number: tuple(json.loads(text)) for number, text in texts}
     return [(t, verdict, data, meters[layout]) for t, verdict, data, layout in reversed(found)]
+
+
+# --- Layouts ---
+
+
+def layout_ids(
+    connection: sa.Connection, insert: Callable[[sa.Table], Any], wanted: Iterable[tuple[str, ...]]
+) -> dict[tuple[str, ...], int]:
+    """Return the ids of layouts by their meters; new ones are stored.
+
+    insert: `Connections.insert`.
+    """
+    texts = {meters: _layout(meters) for meters in wanted}
+    digests = dict(texts.values())
+    known = sa.select(LAYOUT.c.digest, LAYOUT.c.id).where(LAYOUT.c.digest.in_(digests))
+    found = {row.digest: row.id for row in connection.execute(known)}
+    # In one order: two workers that add the same layouts wait for each other only once.
+    new = [{"meters": digests[key], "digest": key} for key in sorted(digests.keys() - found.keys())]
+    if new:
+        connection.execute(insert(LAYOUT).on_conflict_do_nothing(), new)
+        found = {row.digest: row.id for row in connection.execute(known)}
+    return {meters: int(found[key]) for meters, (key, _) in texts.items()}
+
+
+@lru_cache(maxsize=1024)
+def _layout(meters: tuple[str, ...]) -> tuple[str, str]:
+    """Digest and text of the layout of a row."""
+    text = json.dumps(meters)
+    return digest(text), text
 
 
 # --- Roll-ups ---

@@ -14,7 +14,6 @@ import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -32,6 +31,7 @@ from service.store.rollups import (
     AlarmSpan,
     add_rollups,
     feeders_in,
+    layout_ids,
     prune_rollups,
     read_alarm_spans,
     read_series,
@@ -58,7 +58,6 @@ from service.store.schema import (
     Rejected,
     StoreUnavailable,
     WriterLost,
-    digest,
     migrate,
     words_of,
 )
@@ -777,7 +776,7 @@ class Store(Reader):
         self, connection: sa.Connection, reports: Sequence[Kept], rolled: dict[str, float]
     ) -> None:
         found = [(report, report.row) for report in reports]
-        layouts = self._layouts(connection, {row.meters for _, row in found})
+        layouts = layout_ids(connection, self._connections.insert, {row.meters for _, row in found})
         rows = [
             {
                 "feeder": report.feeder,
@@ -820,21 +819,6 @@ class Store(Reader):
         )
         prune_rollups(connection, pruned(ROLLUP), report.t - keep, limit=_PRUNED_AT_ONCE)
 
-    def _layouts(
-        self, connection: sa.Connection, wanted: Iterable[tuple[str, ...]]
-    ) -> dict[tuple[str, ...], int]:
-        """Return the ids of layouts by their meters; new ones are stored."""
-        texts = {meters: _layout(meters) for meters in wanted}
-        digests = dict(texts.values())
-        known = sa.select(LAYOUT.c.digest, LAYOUT.c.id).where(LAYOUT.c.digest.in_(digests))
-        found = {row.digest: row.id for row in connection.execute(known)}
-        # In one order: two workers that add the same layouts wait for each other only once.
-        new = [{"meters": digests[key], "digest": key} for key in sorted(digests.keys() - found.keys())]
-        if new:
-            connection.execute(self._connections.insert(LAYOUT).on_conflict_do_nothing(), new)
-            found = {row.digest: row.id for row in connection.execute(known)}
-        return {meters: int(found[key]) for meters, (key, _) in texts.items()}
-
 
 _ALL = 1_000_000
 """Limit of a read of all unpublished events."""
@@ -852,13 +836,6 @@ def _selected(
         if len(page) < limit or len(found) >= limit:
             return found[:limit]
         after = page[-1].seq
-
-
-@lru_cache(maxsize=1024)
-def _layout(meters: tuple[str, ...]) -> tuple[str, str]:
-    """Digest and text of the layout of a row."""
-    text = json.dumps(meters)
-    return digest(text), text
 
 
 def _count_change(connection: sa.Connection) -> int:
