@@ -244,8 +244,8 @@ def access_control(plan: Plan, owners: Mapping[tuple[str, str], str]) -> dict[st
     }
 
 
-_CLUSTER = ("put", "query", "reply", "declare_subscriber", "declare_queryable")
-"""Messages between front and workers."""
+_CLUSTER = ("query", "reply", "declare_queryable")
+"""Calls between front and workers, and their answers."""
 
 
 def _shared_rules(plan: Plan) -> list[dict[str, Any]]:

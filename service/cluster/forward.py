@@ -1,7 +1,8 @@
-"""Owners of the feeders by the messages of the workers, and forwarding of requests to them.
+"""Owners of the feeders by the states of the workers, and forwarding of requests to them.
 
-The newest message with the highest epoch of a shard counts. A worker is silent after `HEARD_S` without a
-message: its feeders then have no owner, until another worker reports their shards.
+Each live worker is asked for its state, one call at a time. The newest state with the highest epoch of a
+shard counts. A worker is silent after `HEARD_S` without a state: its feeders then have no owner, until
+another worker reports their shards.
 
 A request with a feeder in its path goes to the owner of this feeder. A command on an alarm, incident, shelf
 or planned work goes to the owner of its feeder. All other requests are answered by the front.
@@ -15,43 +16,39 @@ import math
 import re
 import threading
 import time
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 from weakref import WeakValueDictionary
 
-import structlog
 from anyio import CapacityLimiter, to_thread
 from starlette.requests import Request
 from starlette.responses import Response
 
-from gridsec.errors import GridsecError
 from service.access.identity import OPEN, Identity
 from service.alarms.state_machine import AlarmUnknown
 from service.cluster.messages import (
     FORWARDED,
-    STATES,
     Answer,
+    Ask,
     Call,
     Entry,
     Envelope,
-    MessageRefused,
+    Refusals,
     WorkerState,
+    call,
     rest_key,
+    state_key,
 )
 from service.errors import FeederFixed, NoOwner, TooManyFeeders, WorkerBusy
-from service.ingest.queues import BusUnavailable
 from service.store import OutcomeUnknown
 from service.store.leases import shard_of
 from service.store.store import Reader
 
-TELL_S: Final = 10.0
-"""Shortest interval of log lines about refused messages, s."""
 HEARD_S: Final = 3.0
-"""Age of a worker's last message after which it is silent, s."""
+"""Age of a worker's last state after which it is silent, s."""
 FORGET_S: Final = 3600.0
-"""Age after which its last message is forgotten, s."""
-_log = structlog.get_logger("gridsec.cluster")
+"""Age after which its last state is forgotten, s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,29 +60,22 @@ class _Heard:
 class Workers:
     """The heard workers. Thread-safe.
 
-    changed: called from another thread after a message.
+    changed: called after a state, from the thread that took it.
     """
 
-    def __init__(self, envelope: Envelope) -> None:
-        self._envelope = envelope
+    def __init__(self) -> None:
         self.changed: Callable[[], None] = lambda: None
         self._lock = threading.Lock()
         self._heard: dict[str, _Heard] = {}
         self._owners: dict[int, tuple[int, str]] = {}
-        self._refused, self._tell_at = 0, float("-inf")
 
-    def take(self, payload: bytes) -> None:
-        """Take a message."""
-        try:
-            state = WorkerState.of(self._envelope.open(STATES, payload))
-        except (MessageRefused, ValueError, KeyError, TypeError) as error:
-            self._refuse(str(error))
-            return
+    def take(self, state: WorkerState) -> None:
+        """Take a state."""
         now = time.monotonic()
         with self._lock:
             before = self._heard.get(state.worker)
             if before is not None and state.order <= before.state.order:
-                return  # repeated, or overtaken
+                return  # of an earlier process with this name
             self._heard[state.worker] = _Heard(now, state)
             for name in [one for one, kept in self._heard.items() if now - kept.at > FORGET_S]:
                 del self._heard[name]
@@ -93,13 +83,6 @@ class Workers:
                 if epoch >= self._owners.get(shard, (0, ""))[0]:
                     self._owners[shard] = (epoch, state.worker)
         self.changed()
-
-    def _refuse(self, problem: str) -> None:
-        """Count a refused message, with a line of the log every `TELL_S`."""
-        self._refused += 1
-        if time.monotonic() >= self._tell_at:
-            _log.warning("messages of workers are refused", messages=self._refused, latest=problem)
-            self._refused, self._tell_at = 0, time.monotonic() + TELL_S
 
     def states(self) -> list[WorkerState]:
         """Latest states of the workers that are not silent."""
@@ -120,7 +103,7 @@ class Workers:
     def entry(self, feeder: str) -> Entry | None:
         """Entry of a feeder by its owner; None without an owner, or before it has taken over.
 
-        The age of its tick includes the time since the message.
+        The age of its tick includes the time since the state.
         """
         found = self.owner(feeder)
         entry = None if found is None else found[0].feeders.get(feeder)
@@ -135,6 +118,51 @@ class Workers:
         with self._lock:
             found = [one for one in self._heard.values() if feeder in one.state.feeders]
         return max(found, key=lambda one: one.at).state.feeders[feeder] if found else None
+
+
+STATE_S: Final = 1.0
+"""Time limit of a call for a state, s; a late state answers the next call."""
+AGAIN_S: Final = 0.1
+"""Wait after a call without an answer, s."""
+
+
+class StateCalls:
+    """Calls for the states of the live workers, one at a time for each.
+
+    workers: takes the states.
+    """
+
+    def __init__(self, workers: Workers, ask: Ask, envelope: Envelope) -> None:
+        self._workers, self._ask, self._envelope = workers, ask, envelope
+        self._threads = CapacityLimiter(math.inf)
+        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._refusals = Refusals("states of another version are refused")
+
+    def follow(self, names: Collection[str]) -> None:
+        """Ask exactly these workers, in the running event loop."""
+        for name in self._tasks.keys() - set(names):
+            self._tasks.pop(name).cancel()
+        for name in set(names) - self._tasks.keys():
+            self._tasks[name] = asyncio.create_task(self._ask_again(name), name=f"state of {name}")
+
+    async def _ask_again(self, worker: str) -> None:
+        while True:
+            if not await to_thread.run_sync(
+                self.ask_blocking, worker, abandon_on_cancel=True, limiter=self._threads
+            ):
+                await asyncio.sleep(AGAIN_S)
+
+    def ask_blocking(self, worker: str) -> bool:
+        """Take the next state of a worker; False without one. Blocks."""
+        found = call(self._ask, self._envelope, state_key(worker), {}, STATE_S)
+        if found is None:
+            return False
+        try:
+            self._workers.take(WorkerState.of(found))
+        except (KeyError, TypeError, ValueError) as error:
+            self._refusals.note(repr(error))
+            return False
+        return True
 
 
 ANSWER_S: Final = 15.0
@@ -152,9 +180,6 @@ BULK_MOST: Final = 1000
 _ID: Final = re.compile(r"[0-9A-Z]{26}")
 _BULK: Final = "POST /api/v1/alarms/ack"
 _FEEDER: Final = "/api/v1/feeders/{feeder}"
-
-Ask = Callable[[str, bytes, float], list[bytes]]
-"""Queries a key as `Bus.ask` does."""
 
 
 class Forwarder:
@@ -275,23 +300,10 @@ class Forwarder:
         finally:
             slots.release()
 
-    def ask_blocking(self, worker: str, call: Call, limit_s: float) -> Answer | None:
+    def ask_blocking(self, worker: str, request: Call, limit_s: float) -> Answer | None:
         """Answer of a worker; None without one. Blocks."""
-        key = rest_key(worker)
-        message = self._envelope.seal(f"call {key}", call.content())
-        number = self._envelope.open(f"call {key}", message)["id"]
-        try:
-            replies = self._ask(key, message, limit_s)
-        except BusUnavailable:
-            return None
-        for reply in replies:
-            try:
-                content = self._envelope.open(f"answer {key}", reply)
-                if content["to"] == number:
-                    return Answer.of(content)
-            except (GridsecError, ValueError, KeyError, TypeError):
-                continue
-        return None
+        found = call(self._ask, self._envelope, rest_key(worker), request.content(), limit_s)
+        return None if found is None else Answer.of(found)
 
     # ------------------------------------------------------------------------------- the feeder of a request
 

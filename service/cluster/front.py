@@ -1,6 +1,6 @@
 """The front of a cluster: REST, web page, event streams and notifications; no engine.
 
-Alarms, incidents and history come from the database. Lists of feeders come from the messages of the workers:
+Alarms, incidents and history come from the database. Lists of feeders come from the states of the workers:
 a feeder without an owner is in them as undecided, cause `no-owner`. Requests for one feeder go to its owner.
 """
 
@@ -25,7 +25,7 @@ from gridsec.interface import Cause, Decision
 from service.access.identity import OPEN
 from service.alarms.state_machine import Alarm, AlarmUnknown
 from service.cluster.catalogue import Catalogue, digest
-from service.cluster.forward import DESIGN_S, Forwarder, Workers, get
+from service.cluster.forward import DESIGN_S, Forwarder, StateCalls, Workers, get
 from service.cluster.messages import Call
 from service.engine.commissioning import CommissioningProgress
 from service.engine.operators import Operators
@@ -138,6 +138,7 @@ class Front:
         self.shelve_most_s = shelve_most_s
         self._workers, self._catalogue = workers, catalogue
         self._way: Forwarder | None = None
+        self._states: StateCalls | None = None
         self._given, self._live_workers = given, live_workers
         self._wall, self._cluster_time = wall, cluster_time
         self._metrics = Metrics()
@@ -152,9 +153,9 @@ class Front:
         self._latest: dict[str, tuple[tuple[str, int, float], FeederReport]] = {}
         self._fetching: dict[str, asyncio.Lock] = {}
 
-    def attach(self, forwarder: Forwarder) -> None:
-        """Set the way to the workers; called before `run`."""
-        self._way = forwarder
+    def attach(self, forwarder: Forwarder, states: StateCalls) -> None:
+        """Set the ways to the workers; called before `run`."""
+        self._way, self._states = forwarder, states
 
     @property
     def _forwarder(self) -> Forwarder:
@@ -179,6 +180,8 @@ class Front:
                 except TimeoutError:
                     continue
         finally:
+            if self._states is not None:
+                self._states.follow(())
             for task in side:
                 task.cancel()
             await asyncio.gather(*side, return_exceptions=True)
@@ -206,6 +209,8 @@ class Front:
         except StoreUnavailable as error:
             self._problem = f"database: {error}"
             return
+        if self._states is not None:
+            self._states.follow(self._registered)
         self._problem = None
         self._read.set()
         if changes.added or changes.removed:
@@ -258,12 +263,12 @@ class Front:
         self._streams.end()
 
     def heard(self) -> None:
-        """Wake streams after a message of a worker; called from any thread."""
+        """Wake streams after a state of a worker; called from any thread."""
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._streams.notify, "state")
 
     def subscribe(self) -> AsyncGenerator[dict[str, Any], None]:
-        """Yield a wake-up after each stored alarm and each message of a worker, until the service stops."""
+        """Yield a wake-up after each stored alarm and each state of a worker, until the service stops."""
         return self._streams.subscribe()
 
     # ---------------------------------------------------------------------------------------------- feeders

@@ -1,16 +1,20 @@
-"""Messages between the processes of a cluster: signed envelopes, states of the workers, REST over zenoh.
+"""Messages between the processes of a cluster: signed calls and their answers over zenoh.
 
-Envelope. A zenoh client may publish on any key that the router permits. Each message therefore has an
-HMAC-SHA256 by a secret that only readers of the database know. The tag covers the purpose and the key: a
-message of one worker is not valid for another one. A message older than `FRESH_S` is refused. The time is
-that of the database (`Leases.clock`): the clocks of the machines do not matter.
+Call. The front queries a key of one worker, and takes the first valid reply. A put on these keys reaches no
+process, because none subscribes to them.
 
-State. A worker sends its leases and the entries of its feeders in the list on `@worker/<worker>/state`: after
-new ticks, at most every `GATHER_S`, and at least every `SILENT_S`. A feeder takes about 0.6 kB. Messages of
-many feeders are rarer, up to `LONGEST_S`, so that they take about `SHARE` of the time.
+Envelope. A zenoh client may query and answer on any key that the router permits. Each message therefore has
+an HMAC-SHA256 by a secret that only readers of the database know. The tag covers the direction and the key: a
+message of one worker is not valid for another one. An answer names its call. A message older than `FRESH_S`
+is refused. The time is that of the database (`Leases.clock`): the clocks of the machines do not matter.
 
-REST. A request is one query on `@worker/<worker>/rest`. The worker executes it on its own HTTP application,
-in process, with the identity that the front has authenticated. No operation is declared twice.
+State, `@worker/<worker>/state`. The answer waits for new ticks, at least until `GATHER_S` and at most until
+`SILENT_S` after the one before. It has the leases of the worker and the entries of its feeders in the list,
+about 0.6 kB for a feeder. States of many feeders are rarer, up to `LONGEST_S`: they take about `SHARE` of the
+time.
+
+REST, `@worker/<worker>/rest`. The worker executes a request on its own HTTP application, in process, with
+the identity that the front has authenticated. No operation is declared twice.
 """
 
 from __future__ import annotations
@@ -19,8 +23,9 @@ import asyncio
 import contextlib
 import hmac
 import secrets
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -31,6 +36,7 @@ from starlette.types import ASGIApp, Message
 from gridsec.errors import GridsecError
 from service.access.identity import OPEN, Identity, Role
 from service.api.dependencies import IDENTITY
+from service.ingest.queues import BusUnavailable
 
 FRESH_S: Final = 30.0
 """Largest age of a message, s."""
@@ -55,7 +61,7 @@ class Envelope:
         self._secret, self._clock = secret, clock
         self._seen: dict[str, float] = {}
 
-    def seal(self, purpose: str, content: dict[str, Any]) -> bytes:
+    def seal(self, purpose: str, content: Mapping[str, Any]) -> bytes:
         """Return a message. `purpose` names the key and the direction."""
         body = cbor2.dumps({"t": self._clock(), "id": secrets.token_hex(8), **content})
         return self._tag(purpose, body) + body
@@ -86,16 +92,91 @@ class Envelope:
         return hmac.digest(self._secret, purpose.encode() + b"\0" + body, "sha256")
 
 
+Ask = Callable[[str, bytes, float], Iterable[bytes]]
+"""Queries a key with a payload, and yields the replies until a time limit, s, as `Bus.ask` does."""
+Content = dict[str, Any]
+"""Content of a message."""
+TELL_S: Final = 10.0
+"""Shortest interval of log lines about refused messages, s."""
+_log = structlog.get_logger("gridsec.cluster")
+
+
+class Refusals:
+    """Count of refused messages, with a line of the log every `TELL_S`. Thread-safe."""
+
+    def __init__(self, event: str) -> None:
+        self._event, self._lock = event, threading.Lock()
+        self._count, self._tell_at = 0, float("-inf")
+
+    def note(self, problem: object) -> None:
+        """Count a refused message."""
+        with self._lock:
+            self._count += 1
+            if (now := time.monotonic()) < self._tell_at:
+                return
+            count, self._count, self._tell_at = self._count, 0, now + TELL_S
+        _log.warning(self._event, messages=count, latest=str(problem))
+
+
+_REPLIES = Refusals("replies of workers are refused")
+
+
+def call(ask: Ask, envelope: Envelope, key: str, content: Content, limit_s: float) -> Content | None:
+    """Content of the first valid answer to a call; None without one within the time limit. Blocks."""
+    number = secrets.token_hex(8)
+    try:
+        for reply in ask(key, envelope.seal(f"call {key}", {**content, "id": number}), limit_s):
+            try:
+                found = envelope.open(f"answer {key}", reply)
+                if found["to"] == number:
+                    return found
+            except (MessageRefused, ValueError, KeyError, TypeError) as error:
+                _REPLIES.note(error)
+    except BusUnavailable:
+        return None
+    return None
+
+
+class CallServer:
+    """Takes the valid calls on a key, each once, to an event loop.
+
+    key: key without the prefix.
+    take: called in the event loop with the content of a call and a function that answers it once.
+    """
+
+    def __init__(
+        self,
+        key: str,
+        envelope: Envelope,
+        loop: asyncio.AbstractEventLoop,
+        take: Callable[[Content, Callable[[Content], None]], None],
+    ) -> None:
+        self._key, self._envelope, self._loop, self._take = key, envelope, loop, take
+        self._refusals = Refusals("calls of the cluster are refused")
+
+    def __call__(self, payload: bytes, respond: Callable[[bytes], None]) -> None:
+        """Take a call from any thread."""
+        try:
+            content = self._envelope.open(f"call {self._key}", payload, once=True)
+        except (MessageRefused, ValueError, KeyError, TypeError) as error:
+            self._refusals.note(error)
+            respond(b"")
+            return
+
+        def answer(found: Content) -> None:
+            respond(self._envelope.seal(f"answer {self._key}", {**found, "to": content["id"]}))
+
+        self._loop.call_soon_threadsafe(self._take, content, answer)
+
+
 GATHER_S: Final = 0.25
-"""Shortest interval of the messages, s."""
+"""Shortest interval of the states, s."""
 SILENT_S: Final = 0.5
-"""Longest interval of the messages without new ticks, s."""
+"""Longest interval of the states without new ticks, s."""
 LONGEST_S: Final = 0.75
-"""Longest interval of the messages of many feeders, s: a worker is silent after four of them."""
+"""Longest interval of the states of many feeders, s."""
 SHARE: Final = 0.03
-"""Part of the processor time of a thread for the messages."""
-STATES: Final = "@worker/*/state"
-"""Keys of the messages of all workers, without the prefix."""
+"""Part of the processor time of a thread for the states."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +204,7 @@ class WorkerState:
     problem: str | None  # problem of the database
     reasons: tuple[str, ...]  # reasons why it is not ready
 
-    def content(self) -> dict[str, Any]:
+    def content(self) -> Content:
         """Content of its message."""
         return {
             "worker": self.worker,
@@ -150,27 +231,42 @@ class WorkerState:
 
 
 def state_key(worker: str) -> str:
-    """Key of the messages of a worker, without the prefix."""
+    """Key of the calls for a state, without the prefix; `@` keeps it out of the feeders' keys."""
     return f"@worker/{worker}/state"
 
 
-async def report_states(
-    content: Callable[[], dict[str, Any]],
-    tell: Callable[[str, bytes], None],
-    worker: str,
-    envelope: Envelope,
-    news: asyncio.Event,
-) -> None:
-    """Send the state of a worker until cancelled; `news` is set after new ticks."""
-    key = state_key(worker)
-    while True:
-        news.clear()
-        begun = time.thread_time()
-        tell(key, envelope.seal(STATES, content()))
-        gather_s = min(max(GATHER_S, (time.thread_time() - begun) / SHARE), LONGEST_S)
-        await asyncio.sleep(gather_s)
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(news.wait(), max(SILENT_S - gather_s, 0.0))
+class StateReports:
+    """States of a worker for the fronts that wait for them.
+
+    content: content of the next state.
+    news: set after new ticks.
+    """
+
+    def __init__(self, content: Callable[[], Content], news: asyncio.Event) -> None:
+        self._content, self._news = content, news
+        self._waiting: list[Callable[[Content], None]] = []
+        self._asked = asyncio.Event()
+
+    def take(self, _: Content, answer: Callable[[Content], None]) -> None:
+        """Take a call; the next state answers it."""
+        self._waiting.append(answer)
+        self._asked.set()
+
+    async def run(self) -> None:
+        """Answer until cancelled."""
+        while True:
+            await self._asked.wait()
+            self._asked.clear()
+            self._news.clear()
+            begun = time.thread_time()
+            content = self._content()
+            waiting, self._waiting = self._waiting, []
+            for answer in waiting:
+                answer(content)
+            gather_s = min(max(GATHER_S, (time.thread_time() - begun) / SHARE), LONGEST_S)
+            await asyncio.sleep(gather_s)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._news.wait(), max(SILENT_S - gather_s, 0.0))
 
 
 FORWARDED: Final = frozenset({"accept", "accept-encoding", "content-type", "if-none-match"})
@@ -179,7 +275,6 @@ _OWN: Final = frozenset(
     {"content-length", "content-security-policy", "x-content-type-options", "referrer-policy"}
 )
 """Headers that the front sets by itself."""
-_log = structlog.get_logger("gridsec.cluster")
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +288,7 @@ class Call:
     body: bytes
     identity: Identity
 
-    def content(self) -> dict[str, Any]:
+    def content(self) -> Content:
         """Content of its message."""
         who = self.identity
         feeders = None if who.feeders is None else sorted(who.feeders)
@@ -208,7 +303,7 @@ class Call:
         }
 
     @classmethod
-    def of(cls, content: dict[str, Any]) -> Call:
+    def of(cls, content: Content) -> Call:
         """The request of a message."""
         identity = OPEN
         if (given := content["identity"]) is not None:
@@ -228,14 +323,14 @@ class Answer:
     body: bytes
 
     @classmethod
-    def of(cls, content: dict[str, Any]) -> Answer:
+    def of(cls, content: Content) -> Answer:
         """The response of a message."""
         headers = tuple((name, value) for name, value in content["headers"])
         return cls(content["status"], headers, content["body"])
 
 
 def rest_key(worker: str) -> str:
-    """Key of the requests to a worker, without the prefix; `@` keeps it out of the feeders' keys."""
+    """Key of the requests to a worker, without the prefix."""
     return f"@worker/{worker}/rest"
 
 
@@ -281,44 +376,24 @@ async def execute(app: ASGIApp, call: Call) -> Answer:
     return Answer(status, tuple(pair for pair in headers if pair[0].lower() not in _OWN), bytes(parts))
 
 
-class RestServer:
-    """Executes the requests to one worker.
+class RestCalls:
+    """Executes requests on the HTTP application of a worker, in the running event loop."""
 
-    app: its HTTP application.
-    key: key of the requests, without the prefix.
-    loop: event loop of the application.
-    """
-
-    def __init__(self, app: ASGIApp, key: str, envelope: Envelope, loop: asyncio.AbstractEventLoop) -> None:
-        self._app, self._key, self._envelope, self._loop = app, key, envelope, loop
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
         self._running: set[asyncio.Task[None]] = set()
 
-    def __call__(self, payload: bytes, respond: Callable[[bytes], None]) -> None:
-        """Take a request from any thread."""
-        try:
-            content = self._envelope.open(f"call {self._key}", payload, once=True)
-        except (MessageRefused, ValueError, KeyError, TypeError) as error:
-            _log.warning("a request of the cluster is refused", problem=str(error))
-            respond(b"")
-            return
+    def take(self, content: Content, answer: Callable[[Content], None]) -> None:
+        """Take a call."""
+        task = asyncio.get_running_loop().create_task(self._execute(content, answer))
+        self._running.add(task)
+        task.add_done_callback(self._running.discard)
 
-        def start() -> None:
-            task = self._loop.create_task(self._execute(content, respond))
-            self._running.add(task)
-            task.add_done_callback(self._running.discard)
-
-        self._loop.call_soon_threadsafe(start)
-
-    async def _execute(self, content: dict[str, Any], respond: Callable[[bytes], None]) -> None:
+    async def _execute(self, content: Content, answer: Callable[[Content], None]) -> None:
         try:
             found = await execute(self._app, Call.of(content))
         except Exception:  # noqa: BLE001 - the application has sent its response 500 before
             _log.exception("a request failed", path=content["path"])
             found = Answer(500, (), b"")
-        reply = {
-            "to": content["id"],
-            "status": found.status,
-            "headers": [list(pair) for pair in found.headers],
-            "body": found.body,
-        }
-        respond(self._envelope.seal(f"answer {self._key}", reply))
+        headers = [list(pair) for pair in found.headers]
+        answer({"status": found.status, "headers": headers, "body": found.body})

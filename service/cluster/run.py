@@ -23,9 +23,9 @@ from gridsec.errors import Problem
 from service.api.listener import Shares, raise_limit
 from service.app import HttpSide, Running, bus_of, load_sites, read_notify
 from service.cluster.catalogue import Catalogue
-from service.cluster.forward import Forwarder, Workers
+from service.cluster.forward import Forwarder, StateCalls, Workers
 from service.cluster.front import Front, ObservedStore
-from service.cluster.messages import STATES, Envelope
+from service.cluster.messages import Envelope
 from service.ingest.align import Clock
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import fixed_listeners
@@ -206,7 +206,7 @@ async def serve_front(
         envelope = Envelope(cluster_secret(settings.database), leases.clock)
         store = stack.enter_context(ObservedStore(settings.database, leases=leases))
         http = HttpSide.open(stack, settings, shares, targets, wall)
-        workers = Workers(envelope)
+        workers = Workers()
         front = Front(
             store,
             workers,
@@ -232,8 +232,7 @@ async def serve_front(
             given=frozenset(sites),
             max_feeders=settings.max_feeders,
         )
-        front.attach(forwarder)
-        bus.hear(STATES, workers.take)
+        front.attach(forwarder, StateCalls(workers, bus.ask, envelope))
         async with _supervised(settings):
             await http.serve(
                 stack,

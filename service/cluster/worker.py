@@ -14,7 +14,7 @@ import re
 import secrets
 import socket
 import time
-from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -28,9 +28,17 @@ from service.api.listener import Shares, raise_limit
 from service.api.routes import create_api
 from service.app import bus_of, runtime_config, stop_on_signals
 from service.cluster.catalogue import Catalogue
-from service.cluster.messages import Entry, Envelope, RestServer, WorkerState, report_states, rest_key
+from service.cluster.messages import (
+    CallServer,
+    Entry,
+    Envelope,
+    RestCalls,
+    StateReports,
+    WorkerState,
+    rest_key,
+    state_key,
+)
 from service.engine.runtime import Runtime
-from service.ingest.zenoh_bus import Bus
 from service.report.feeder_info import Ownership
 from service.settings import Settings
 from service.store import Store, StoreUnavailable
@@ -323,41 +331,32 @@ async def work(
         stack.enter_context(bus)
         runtime.attach(bus)
         loop = asyncio.get_running_loop()
-        key = rest_key(name)
-        bus.serve(key, RestServer(create_api(runtime), key, envelope, loop))
+        news = asyncio.Event()
+        content = partial(_content, runtime, member, lambda: clock_problem(wall(), leases.clock()))
+        reports = StateReports(content, news)
+        calls = {rest_key(name): RestCalls(create_api(runtime)).take, state_key(name): reports.take}
+        for key, take in calls.items():
+            bus.serve(key, CallServer(key, envelope, loop, take))
         stop = asyncio.Event()
         announce(stop.set)
         _log.info("working", worker=name)
         with stop_on_signals(stop, active=signals):
-            content = partial(_content, runtime, member, lambda: clock_problem(wall(), leases.clock()))
-            await _until_stopped(
-                runtime, member, bus, envelope, stop, content=content, stopping=stopping, lost=lost
-            )
+            side = (member.run(runtime, bus), reports.run(), _note_news(runtime, news))
+            await _until_stopped(runtime, side, stop, stopping=stopping, lost=lost)
 
 
 async def _until_stopped(
     runtime: Runtime,
-    member: Member,
-    bus: Bus,
-    envelope: Envelope,
+    tasks: Iterable[Coroutine[Any, Any, None]],
     stop: asyncio.Event,
     *,
-    content: Callable[[], dict[str, Any]],
     stopping: Callable[[], None],
     lost: Callable[[BaseException], None],
 ) -> None:
-    """Run runtime, member and messages until `stop`, or until one of them fails; raise its error."""
-    news = asyncio.Event()
+    """Run a runtime and tasks beside it until `stop`, or until one of them fails; raise its error."""
     running = asyncio.create_task(runtime.run(), name="runtime")
     stopped = asyncio.create_task(stop.wait(), name="stop")
-    side = [
-        asyncio.create_task(member.run(runtime, bus), name="leases"),
-        asyncio.create_task(_note_news(runtime, news), name="news"),
-        asyncio.create_task(
-            report_states(content, bus.tell, member.name, envelope, news),
-            name="states",
-        ),
-    ]
+    side = [asyncio.create_task(one) for one in tasks]
     supervised = asyncio.create_task(systemd.supervise(lambda: runtime.healthy()[0]), name="systemd")
     done, _ = await asyncio.wait({running, stopped, *side}, return_when=asyncio.FIRST_COMPLETED)
     errors = [error for task in done if (error := _error(task)) is not None]
@@ -392,7 +391,7 @@ async def _note_news(runtime: Runtime, news: asyncio.Event) -> None:
 
 
 def _content(runtime: Runtime, member: Member, clock: Callable[[], str | None]) -> dict[str, Any]:
-    """Content of the message of a worker. `clock` returns the problem of its clock."""
+    """Content of the state of a worker. `clock` returns the problem of its clock."""
     unstored, problem = runtime.unstored()
     reasons = runtime.ready()[1] + [one for one in (member.problem, clock()) if one is not None]
     found = WorkerState(

@@ -472,23 +472,24 @@ class Bus:
         self._stack.callback(made.undeclare)
         self._start(f"zenoh {key}", partial(_serve, answer), made.handler)
 
-    def ask(self, key: str, payload: bytes, timeout_s: float) -> list[bytes]:
-        """Query a key, without the prefix; return the payloads of the replies. Blocks."""
+    def ask(self, key: str, payload: bytes, timeout_s: float) -> Iterator[bytes]:
+        """Query a key, without the prefix, and yield the payload of each reply as it arrives. Blocks.
+
+        All queryables are asked, and each reply counts: a false one replaces no other. Raises BusUnavailable.
+        """
         try:
-            replies = self._session().get(f"{self._prefix}/{key}", payload=payload, timeout=timeout_s)
-            return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+            replies = self._session().get(
+                f"{self._prefix}/{key}",
+                payload=payload,
+                timeout=timeout_s,
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+            )
+            for reply in replies:
+                if reply.ok is not None:
+                    yield reply.ok.payload.to_bytes()
         except zenoh.ZError as error:
             raise BusUnavailable(f"zenoh query: {_first_line(error)}", code="query-failed") from error
-
-    def hear(self, key: str, take: Callable[[bytes], None]) -> None:
-        """Call `take` from another thread with each payload that is put on a key, without the prefix."""
-        made = self._session().declare_subscriber(f"{self._prefix}/{key}", zenoh.handlers.RingChannel(RING))
-        self._stack.callback(made.undeclare)
-        self._start(f"zenoh {key}", partial(_hear, take), made.handler)
-
-    def tell(self, key: str, payload: bytes) -> None:
-        """Publish a value without a stored reply; under congestion it is dropped. `key` has no prefix."""
-        self._outgoing.add_telemetry(f"{self._prefix}/{key}", payload)
 
 
 def _serve(
@@ -507,16 +508,6 @@ def _respond(query: zenoh.Query, payload: bytes) -> None:
     """Reply on the key of the query, and end it."""
     with suppress(zenoh.ZError), query:  # the querying session is closed
         query.reply(query.key_expr, payload)
-
-
-def _hear(take: Callable[[bytes], None], handler: zenoh.handlers.Handler[zenoh.Sample]) -> None:
-    while True:
-        try:
-            sample = handler.recv()
-        except zenoh.ZError:
-            return
-        if sample.kind == zenoh.SampleKind.PUT:
-            take(sample.payload.to_bytes())
 
 
 def _has_receiver(publisher: zenoh.Publisher) -> bool:

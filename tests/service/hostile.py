@@ -28,11 +28,11 @@ KEPT = 8
 """Descriptors that may remain: connections of the database and of readers."""
 KINDS = {"single": (), "workers": ("--workers", "2")}
 """Options of `gridsec serve`: one process, or a front with workers."""
-FORMS = ("garbage", "oversized", "stranger", "state", "call")
-"""Kinds of floods: text that is not JSON, payloads above the limit, keys without a feeder, messages of a
-worker, and requests to a worker, both without the secret of the cluster."""
+FORMS = ("garbage", "oversized", "stranger", "call", "answer")
+"""Kinds of floods: text that is not JSON, payloads above the limit, keys without a feeder, and without the
+secret of the cluster calls of a worker and answers in its place, which keep the calls open."""
 FLOOD = """
-import itertools, sys, time
+import collections, itertools, sys
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import session
 form, feeder, worker = sys.argv[2:5]
@@ -45,11 +45,14 @@ with session(BusConfig("client", connect=(sys.argv[1],))) as live:
             live.put(f"gridsec/{feeder}/meter/m01/reading", bytes(400_000))
         elif form == "stranger":
             live.put(f"gridsec/stranger-{number}/meter/m01/reading", b"{}")
-        elif form == "state":
-            live.put(f"gridsec/@worker/{worker}/state", b"0" * 200)
+        elif form == "call":
+            kind = "state" if number % 2 else "rest"
+            live.get(f"gridsec/@worker/{worker}/{kind}", payload=b"0" * 200, timeout=1.0)
         else:
-            live.get(f"gridsec/@worker/{worker}/rest", payload=b"0" * 200, timeout=1.0)
-            time.sleep(0.001)
+            key, kept = f"gridsec/@worker/{worker}/**", collections.deque(maxlen=1000)
+            for query in live.declare_queryable(key, complete=True):
+                query.reply(query.key_expr, b"0" * 200)
+                kept.append(query)
 """
 """Flood of one peer, as fast as the router takes it: endpoint, form, feeder, worker."""
 

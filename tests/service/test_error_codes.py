@@ -370,7 +370,7 @@ def query_fails(_: Path, __: Patch) -> None:
 
     bus = Bus(BusConfig(), "gridsec", lambda _: None, max_payload=1, lossless=False)
     bus._live = cast(Any, SimpleNamespace(get=get))
-    bus.ask("key", b"", 1.0)
+    list(bus.ask("key", b"", 1.0))
 
 
 def wrong_targets(place: Path, _: Patch) -> None:

@@ -12,7 +12,7 @@ import pytest
 from feeders.model.site import Site, load
 from service.cluster import front as module
 from service.cluster.catalogue import Catalogue
-from service.cluster.forward import DESIGN_S, Workers
+from service.cluster.forward import DESIGN_S, StateCalls, Workers
 from service.cluster.front import Front, ObservedStore
 from service.cluster.messages import Answer, Call, Envelope
 from service.errors import NoOwner
@@ -49,14 +49,15 @@ def test_a_refused_feeder_does_not_block_the_next_one(
     with ObservedStore(f"sqlite:///{tmp_path}/g.db") as store:
         front = Front(
             store,
-            Workers(Envelope(b"secret")),
+            Workers(),
             Catalogue(store),
             copies(load("cigre-lv"), "a", "b"),
             live_workers=list,
             shelve_most_s=3600.0,
             wall=time.time,
         )
-        front.attach(owners)  # type: ignore[arg-type]
+        states = StateCalls(Workers(), lambda *_: [], Envelope(b"secret"))
+        front.attach(owners, states)  # type: ignore[arg-type]
 
         async def run() -> None:
             await front.refresh()

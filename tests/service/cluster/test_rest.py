@@ -14,7 +14,7 @@ from starlette.requests import Request
 from service.access.identity import OPEN, Identity, Role
 from service.api.routes import create_api
 from service.cluster.forward import Forwarder, Workers, get
-from service.cluster.messages import STATES, Call, Entry, Envelope, RestServer, WorkerState, rest_key
+from service.cluster.messages import Call, CallServer, Entry, Envelope, RestCalls, WorkerState, rest_key
 from service.errors import NoOwner
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import Bus
@@ -43,9 +43,10 @@ class Pair:
         self.thread.start()
         self.key = rest_key("w0")
         envelope = Envelope(b"secret")
-        worker.serve(self.key, RestServer(create_api(service), self.key, envelope, self.loop))
+        take = RestCalls(create_api(service)).take
+        worker.serve(self.key, CallServer(self.key, envelope, self.loop, take))
         self.front, self.envelope = front, envelope
-        self.workers = Workers(envelope)
+        self.workers = Workers()
         self.worker = worker
         self.names: set[str] = set()
         self.messages = 0
@@ -64,7 +65,7 @@ class Pair:
         entries = {name: Entry({"name": name}, {}) for name in feeders}
         self.messages += 1
         state = WorkerState("w0", (1, self.messages), shards, entries, 0, None, ())
-        self.workers.take(Envelope(b"secret").seal(STATES, state.content()))
+        self.workers.take(state)
 
     def status(self, feeder: str) -> int:
         """Status of a forwarded read of a feeder."""
@@ -94,7 +95,7 @@ def pair(small_service: Callable[..., SmallService]) -> Iterator[Pair]:
     end = f"tcp/127.0.0.1:{free_port()}"
     with bus(BusConfig(listen=(end,))) as front, bus(BusConfig("client", connect=(end,))) as worker:
         made = Pair(small_service(Village(), Village("town")), worker, front)
-        until(lambda: front.ask(made.key, b"", 5.0), "the declaration of the worker at the front")
+        until(lambda: list(front.ask(made.key, b"", 5.0)), "the declaration of the worker at the front")
         yield made
         made.close()
 
@@ -131,12 +132,12 @@ def test_the_identity_of_the_front_counts(pair: Pair) -> None:
 def test_without_the_secret_nothing_is_executed_or_believed(pair: Pair) -> None:
     call = get("/api/v1/feeders")
     forged = Envelope(b"guess").seal(f"call {pair.key}", call.content())
-    assert pair.front.ask(pair.key, forged, 5.0) == [b""]
+    assert list(pair.front.ask(pair.key, forged, 5.0)) == [b""]
     message = pair.envelope.seal(f"call {pair.key}", call.content())
     (first,) = pair.front.ask(pair.key, message, 5.0)
     assert first
     # A repetition is not executed.
-    assert pair.front.ask(pair.key, message, 5.0) == [b""]
+    assert list(pair.front.ask(pair.key, message, 5.0)) == [b""]
 
 
 def test_a_feeder_is_not_absent_during_its_take_over(pair: Pair) -> None:
@@ -154,11 +155,11 @@ def test_a_worker_that_is_gone_gives_no_answer(pair: Pair) -> None:
 
 
 def test_a_request_does_not_outlast_its_owner(pair: Pair) -> None:
-    workers, sender = Workers(pair.envelope), Envelope(b"secret")
+    workers = Workers()
 
     def report(worker: str, epoch: int) -> None:
         state = WorkerState(worker, (1, epoch), {shard_of("village"): epoch}, {}, 0, None, ())
-        workers.take(sender.seal(STATES, state.content()))
+        workers.take(state)
 
     unanswered: list[Callable[[bytes], None]] = []
     pair.worker.serve(rest_key("deaf"), lambda _, respond: unanswered.append(respond))
@@ -178,7 +179,7 @@ def test_a_request_does_not_outlast_its_owner(pair: Pair) -> None:
 
     with refused(NoOwner, "no-owner"):
         asyncio.run(ask("GET"))
-    workers = Workers(pair.envelope)
+    workers = Workers()
     forwarder._workers = workers
     with refused(OutcomeUnknown, "outcome-unknown"):
         asyncio.run(ask("POST"))
