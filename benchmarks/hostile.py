@@ -4,8 +4,8 @@
 
 Idle connections, stalled streams, and floods of one peer by form (`tests.service.hostile`), each for SECONDS.
 For each attack: slowest list of the feeders, largest age of a tick of the other feeders, late ones (age above
-5 s), failed requests, growth of private memory and of the logs. Exit code 1 if a feeder is late or a request
-fails.
+5 s), those with another verdict, failed requests, growth of private memory and of the logs. Exit code 1 if a
+feeder is late or changes its verdict, or a request fails.
 """
 
 from __future__ import annotations
@@ -33,8 +33,11 @@ def main() -> int:
     """Measure, and print a table."""
     asked = arguments(__doc__, seconds=20.0, feeders=4)
     missed = False
-    print("| processes | attack | list, s | age, s | late | failed | memory, MB | log lines |", flush=True)
-    print("|---|---|---|---|---|---|---|---|", flush=True)
+    print(
+        "| processes | attack | list, s | age, s | late | changed | failed | memory, MB | log lines |",
+        flush=True,
+    )
+    print("|---|---|---|---|---|---|---|---|---|", flush=True)
     with running(installed_postgresql()) as server:
         for kind, options in hostile.KINDS.items():
             with (
@@ -49,9 +52,11 @@ def main() -> int:
                     cost = hostile.attacked(live, attack(), asked.seconds)
                     watch, late = cost.watch, cost.watch.late(names)
                     age_s = max(watch.ages_s.get(name, float("inf")) for name in names)
-                    cells = f"{watch.slowest_s:.2f} | {age_s:.1f} | {len(late)} | {len(watch.failed)}"
+                    changed = [name for name in names if watch.verdicts.get(name) != {"clean"}]
+                    counts = f"{len(late)} | {len(changed)} | {len(watch.failed)}"
+                    cells = f"{watch.slowest_s:.2f} | {age_s:.1f} | {counts}"
                     print(f"| {kind} | {name} | {cells} | {cost.memory_mb:+.1f} | {cost.lines} |", flush=True)
-                    missed |= bool(late or watch.failed)
+                    missed |= bool(late or changed or watch.failed)
                     decided(live)
     return int(missed)
 

@@ -73,16 +73,6 @@ class Host(Protocol):
         """Note the feeders of this process that cannot be loaded, with the reasons."""
 
 
-class Readings(Protocol):
-    """Subscriptions to readings, such as `Bus`."""
-
-    def follow(self, feeder: str) -> None:
-        """Subscribe to the readings of a feeder; idempotent."""
-
-    def unfollow(self, feeder: str) -> None:
-        """End the subscription; idempotent."""
-
-
 class Member:
     """Membership of one worker in the cluster; runs in the event loop of its runtime.
 
@@ -131,13 +121,13 @@ class Member:
 
     # ------------------------------------------------------------------------------------------- tasks
 
-    async def run(self, host: Host, readings: Readings) -> None:
+    async def run(self, host: Host) -> None:
         """Hold leases until cancelled. Raises LeaseLost."""
         self._beat_at = time.monotonic()
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._beat())
             tasks.create_task(self._keep())
-            tasks.create_task(self._share(host, readings))
+            tasks.create_task(self._share(host))
             tasks.create_task(self._load_ahead())
 
     async def _beat(self) -> None:
@@ -166,7 +156,7 @@ class Member:
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(self._renew.wait(), RENEW_S)
 
-    async def _share(self, host: Host, readings: Readings) -> None:
+    async def _share(self, host: Host) -> None:
         """Claim free shards, release superfluous ones, and follow changes of the feeders."""
         refresh_at, balance_at = 0.0, time.monotonic() + BALANCE_S
         while True:
@@ -175,9 +165,9 @@ class Member:
                 await self._asked("read the feeders of", self._refresh)
                 refresh_at = now + REFRESH_S
             await self._asked("claim shards in", self._leases.claim)
-            await self._reconcile(host, readings)
+            await self._reconcile(host)
             if now >= balance_at:
-                await self._release(host, readings)
+                await self._release(host)
                 balance_at = time.monotonic() + BALANCE_S
             await asyncio.sleep(POLL_S)
 
@@ -192,14 +182,12 @@ class Member:
         held = self._leases.held
         return {name for name in self._catalogue.feeders if shard_of(name) in held}
 
-    async def _reconcile(self, host: Host, readings: Readings) -> None:
+    async def _reconcile(self, host: Host) -> None:
         """Monitor exactly the feeders of the held shards."""
         wanted = self._wanted()
         # A command that ends after the release of its shard leaves a monitor without a lease.
         monitored = {name for name in self._catalogue.feeders if host.known(name)}
         gone, new = (self._ours | monitored) - wanted, wanted - self._ours - self._unloaded.keys()
-        for name in gone:
-            readings.unfollow(name)
         self._ours -= gone
         for name in [one for one in self._unloaded if one not in wanted or host.known(one)]:
             del self._unloaded[name]
@@ -207,13 +195,12 @@ class Member:
         if gone:
             await self._attempt(host.resign(gone))
         for name in [one for one in new if host.known(one)]:  # put over REST
-            readings.follow(name)
             self._ours.add(name)
             new.remove(name)
         if new:
-            await self._adopt(host, readings, new)
+            await self._adopt(host, new)
 
-    async def _adopt(self, host: Host, readings: Readings, names: Collection[str]) -> None:
+    async def _adopt(self, host: Host, names: Collection[str]) -> None:
         began = time.monotonic()
         # An earlier owner may have stored newer tables before the claim.
         if not await self._asked("read the feeders of", self._refresh):
@@ -223,22 +210,17 @@ class Member:
             return
         self._unloaded |= {name: one for name, one in found.items() if isinstance(one, str)}
         sites = [one for one in found.values() if isinstance(one, Site)]
-        for site in sites:
-            # Readings wait in the queue while the state is read.
-            readings.follow(site.feeder.name)
         if sites and await self._attempt(host.adopt(sites)):
             self._ours |= {site.feeder.name for site in sites}
             lasted = round(time.monotonic() - began, 3)
             _log.info("feeders are taken over", feeders=len(sites), seconds=lasted)
 
-    async def _release(self, host: Host, readings: Readings) -> None:
+    async def _release(self, host: Host) -> None:
         """Release shards that a worker with less weight is due, after their feeders' state is stored."""
         shards = await self._asked("plan shards in", self._leases.excess)
         if not shards:
             return
         leaving = [name for name in self._ours if shard_of(name) in set(shards)]
-        for name in leaving:
-            readings.unfollow(name)
         # After a failure they are taken back as new ones.
         self._ours -= set(leaving)
         if leaving and not await self._attempt(host.resign(leaving)):
@@ -341,7 +323,7 @@ async def work(
         announce(stop.set)
         _log.info("working", worker=name)
         with stop_on_signals(stop, active=signals):
-            side = (member.run(runtime, bus), reports.run(), _note_news(runtime, news))
+            side = (member.run(runtime), reports.run(), _note_news(runtime, news))
             await _until_stopped(runtime, side, stop, stopping=stopping, lost=lost)
 
 

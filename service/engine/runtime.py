@@ -12,10 +12,10 @@ import asyncio
 import contextlib
 import time
 from collections import deque
-from collections.abc import AsyncGenerator, Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Callable, Collection, Iterable, Mapping, Sequence, Set
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import structlog
 
@@ -93,6 +93,16 @@ class WakeUps:
             self._queues.discard(queue)
 
 
+class Network(Publisher, Protocol):
+    """Source of readings and destination of results, such as `zenoh_bus.Bus`."""
+
+    def follow(self, feeder: str) -> None:
+        """Subscribe to the readings of a feeder; idempotent."""
+
+    def unfollow(self, feeder: str) -> None:
+        """End the subscription; idempotent."""
+
+
 class Runtime:
     """The running service; backend of the API.
 
@@ -138,6 +148,9 @@ class Runtime:
             feeder_of=self._feeder_of,
         )
         self._prefix = f"{config.prefix}/"
+        self._bus: Network | None = None
+        self._followed: Set[str] = frozenset()
+        self._expected: Set[str] = frozenset()
         self._dropped = 0
         self._commands: deque[tuple[Callable[[], Future[Any]], asyncio.Future[Any]]] = deque()
         self._prepared: set[asyncio.Future[tuple[Site, DesignedEstimator]]] = set()
@@ -157,9 +170,9 @@ class Runtime:
         name = key.removeprefix(self._prefix).partition("/")[0]
         return name if name in self._engine.monitors else None
 
-    def attach(self, publisher: Publisher) -> None:
-        """Set the publisher of estimates and alarms; called before `run`."""
-        self._engine.committer.publisher = publisher
+    def attach(self, bus: Network) -> None:
+        """Set the source of readings and destination of estimates and alarms; called before `run`."""
+        self._bus = self._engine.committer.publisher = bus
 
     def deliver(self, batch: list[Sample]) -> int:
         """Take samples from a receiving thread; return the number of dropped ones."""
@@ -185,6 +198,7 @@ class Runtime:
                     await asyncio.sleep(GATHER_S)
                     continue
                 await self._execute_commands()
+                self._follow()
                 news = await self._in_worker(self._round)
                 self._last_round = time.monotonic()
                 self._engine.metrics.queue.set(len(self._inbox))
@@ -203,6 +217,17 @@ class Runtime:
                 answer.cancel()
             self._worker.shutdown(wait=False)
             self._writer.shutdown(wait=False)
+
+    def _follow(self) -> None:
+        """Subscribe to the readings of exactly the monitored and the expected feeders."""
+        wanted = self._engine.monitors.keys() | self._expected
+        if self._bus is None or wanted == self._followed:
+            return
+        for name in self._followed - wanted:
+            self._bus.unfollow(name)
+        for name in wanted - self._followed:
+            self._bus.follow(name)
+        self._followed = wanted
 
     def _design(self, monitor: FeederMonitor) -> None:
         design_jobs.begin(monitor, lambda install: self._in_loop(partial(self._hand_over, install)))
@@ -519,7 +544,13 @@ class Runtime:
 
     async def adopt(self, sites: Sequence[Site]) -> None:
         """Go on with feeders of another process as `Engine.adopt` does; their designs follow."""
-        await self._command(partial(self._engine.adopt, sites, self._design))
+        # Readings wait in the queue while the state is read.
+        self._expected = {site.feeder.name for site in sites}
+        try:
+            self._follow()
+            await self._command(partial(self._engine.adopt, sites, self._design))
+        finally:
+            self._expected = frozenset()
         self._streams.notify("state")
 
     async def resign(self, names: Collection[str]) -> None:

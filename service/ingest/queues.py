@@ -124,7 +124,8 @@ class Inbox:
     """Queue of samples before the runtime, bounded in number and bytes.
 
     Each feeder has a queue of its own. When full, the largest one drops the oldest samples of the keys with
-    the most: a flood displaces its own samples first.
+    the most: a flood displaces its own samples first. Samples without a monitored feeder, which become bad
+    readings only, wait in a short queue: of no more than one round.
 
     wake: called from the sender's thread after samples have been added.
     max_samples, max_bytes: the bounds.
@@ -192,14 +193,14 @@ class Inbox:
                 lane.bytes += size
                 self._length += 1
                 self._bytes += size
+                if name is None and not self._lossless and len(lane.waiting) > LANE_SAMPLES:
+                    dropped += self._drop(lane)
                 while self._length > 1 and self._full(0):
-                    dropped += self._drop()
+                    dropped += self._drop(max(self._lanes.values(), key=lambda one: one.bytes))
         self._wake()
         return dropped
 
-    def _drop(self) -> int:
-        """Drop samples of the largest queue."""
-        lane = max(self._lanes.values(), key=lambda one: one.bytes)
+    def _drop(self, lane: _Lane) -> int:
         before = lane.bytes
         dropped = lane.drop()
         self._bytes -= before - lane.bytes

@@ -12,9 +12,10 @@ import json
 import re
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
+from itertools import chain, islice
 from typing import Any
 
 import structlog
@@ -43,6 +44,7 @@ stop the others.
 """
 
 BATCH = 1024
+"""Largest number of samples that are taken from one queue before the next one."""
 _HEAD = 1024
 QUERIES_WAITING = 256
 _ESTIMATES = 1024
@@ -186,7 +188,9 @@ class Bus:
     wall: wall clock, Unix s.
     missed: called with `alarm` or `incident`, a number and a limit; returns the stored events after the
         number, oldest first. A GridsecError that it raises is the reply. None: such queries get no reply.
-    everything: subscribe to all keys below the prefix. Otherwise `follow` subscribes to single feeders.
+    everything: receive the keys of all other feeders as well, to report them as bad readings.
+
+    Each followed feeder has a queue of its own: a flood on other keys displaces none of its samples.
     """
 
     def __init__(
@@ -204,6 +208,7 @@ class Bus:
         self._wall, self._missed, self._everything = wall, missed, everything
         self._live: zenoh.Session | None = None
         self._followed: dict[str, zenoh.Subscriber[Any]] = {}
+        self._others: zenoh.Subscriber[Any] | None = None
         self._closing = threading.Event()
         self._config = config
         self._prefix = prefix
@@ -223,10 +228,11 @@ class Bus:
         with ExitStack() as stack:
             live = self._live = stack.enter_context(session(self._config))
             if self._everything:
-                # Its pattern also matches wrong keys: they are reported as bad readings.
-                subscriber = self._subscribe(live, "**")
-                stack.callback(subscriber.undeclare)
-                self._start("zenoh **", self._receive, subscriber.handler)
+                # Its pattern also matches wrong keys.
+                others = self._others = self._subscribe(live, "**")
+                stack.callback(others.undeclare)
+            if self._lossless:
+                self._start("zenoh readings", self._receive, self._others)
             else:
                 self._start("zenoh readings", self._poll, self._closing)
                 stack.callback(self._closing.set)
@@ -270,44 +276,46 @@ class Bus:
         return live.declare_subscriber(f"{self._prefix}/{pattern}", ring, allowed_origin=remote)
 
     def follow(self, feeder: str) -> None:
-        """Subscribe to the keys of one feeder; idempotent."""
-        if feeder not in self._followed:
+        """Receive the keys of one feeder; idempotent. With `lossless` one queue keeps the order of all."""
+        if not self._lossless and feeder not in self._followed:
             self._followed[feeder] = self._subscribe(self._session(), f"{feeder}/**")
 
     def unfollow(self, feeder: str) -> None:
-        """End the subscription of `follow`; idempotent."""
+        """End the effect of `follow`; idempotent."""
         if (made := self._followed.pop(feeder, None)) is not None:
             made.undeclare()  # type: ignore[no-untyped-call]
 
-    def _receive(self, handler: zenoh.handlers.Handler[zenoh.Sample]) -> None:
+    def _receive(self, every: zenoh.Subscriber[Any]) -> None:
         """Deliver the samples of one subscription until it ends."""
         while True:
             try:
-                raw: zenoh.Sample | None = handler.recv()
+                first = every.handler.recv()
             except zenoh.ZError:  # the subscription is closed and drained
                 return
-            self._deliver(self._taken(handler, raw))
+            self._pass_on(_waiting(every, first))
 
     def _poll(self, closing: threading.Event) -> None:
-        """Deliver the samples of all followed feeders until `closing` is set; one batch of each in turn."""
+        """Deliver the samples of all subscriptions until `closing` is set; one batch of each in turn."""
         while not closing.wait(POLL_S):
-            for made in list(self._followed.values()):
-                if batch := self._taken(made.handler, _try_recv(made.handler)):
-                    self._deliver(batch)
+            for one in list(self._followed.values()):
+                self._pass_on(_waiting(one))
+            if self._others is not None:
+                self._pass_on(_waiting(self._others), self._followed)
 
-    def _taken(self, handler: zenoh.handlers.Handler[zenoh.Sample], raw: zenoh.Sample | None) -> list[Sample]:
-        """Copies of a sample and of those that wait behind it, of up to `BATCH` samples."""
+    def _pass_on(self, samples: Iterable[zenoh.Sample], left_out: Container[str] = ()) -> None:
+        """Deliver copies of the readings among some samples, except those of some feeders."""
         batch: list[Sample] = []
-        while raw is not None:
+        start = len(self._prefix) + 1
+        for raw in samples:
             key = str(raw.key_expr)
-            if self._published_by_others(key):
-                pass
-            elif raw.kind == zenoh.SampleKind.DELETE:
+            if key[start:].partition("/")[0] in left_out or self._published_by_others(key):
+                continue
+            if raw.kind == zenoh.SampleKind.DELETE:
                 self.counts.deleted += 1
             else:
                 batch.append(self._copy(raw, key))
-            raw = _try_recv(handler) if len(batch) < BATCH else None
-        return batch
+        if batch:
+            self._deliver(batch)
 
     def _published_by_others(self, key: str) -> bool:
         """True for keys that another service with this prefix publishes."""
@@ -560,6 +568,11 @@ def _reply(query: zenoh.Query, key: str, payload: bytes, number: int | None = No
 def _refuse(query: zenoh.Query, problem: str) -> None:
     with suppress(zenoh.ZError):  # the querying session is closed
         query.reply_err(json.dumps({"detail": problem}), encoding=JSON)
+
+
+def _waiting(subscriber: zenoh.Subscriber[Any], *first: zenoh.Sample) -> Iterator[zenoh.Sample]:
+    """Some samples and those that wait in the queue of a subscription behind them, up to `BATCH` together."""
+    return islice(chain(first, iter(partial(_try_recv, subscriber.handler), None)), BATCH)
 
 
 def _try_recv(handler: zenoh.handlers.Handler[zenoh.Sample]) -> zenoh.Sample | None:

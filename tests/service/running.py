@@ -63,6 +63,13 @@ class Outlet:
         self.answers: list[str] = []
         self.withdrawn: list[str] = []
         self.confirms = confirms
+        self.followed: set[str] = set()
+
+    def follow(self, feeder: str) -> None:
+        self.followed.add(feeder)
+
+    def unfollow(self, feeder: str) -> None:
+        self.followed.remove(feeder)
 
     def telemetry(self, key: str, payload: Value) -> None:
         assert key == f"{FEEDER}/estimate"

@@ -62,7 +62,6 @@ class Monitors:
 
     def __init__(self) -> None:
         self.sites: dict[str, Site] = {}
-        self.followed: set[str] = set()
 
     async def adopt(self, sites: Sequence[Site]) -> None:
         self.sites |= {site.feeder.name: site for site in sites}
@@ -76,12 +75,6 @@ class Monitors:
 
     def set_unloaded(self, reasons: object) -> None:
         assert reasons == {}
-
-    def follow(self, feeder: str) -> None:
-        self.followed.add(feeder)
-
-    def unfollow(self, feeder: str) -> None:
-        self.followed.discard(feeder)
 
 
 def member_of(shards: Shards, catalogue: Catalogue) -> Member:
@@ -111,9 +104,8 @@ def test_tables_stored_before_the_claim_are_taken_over(store: Store, site: Site)
     catalogue, host = Catalogue(store), Monitors()
     catalogue.refresh()
     store.commit(put=(NAME, titled(site, "new")))
-    asyncio.run(member_of(Shards(NAME), catalogue)._reconcile(host, host))
+    asyncio.run(member_of(Shards(NAME), catalogue)._reconcile(host))
     assert host.sites[NAME].tables.meta.title == "new"
-    assert host.followed == {NAME}
 
 
 def test_a_monitor_without_a_lease_is_ended(store: Store, site: Site) -> None:
@@ -122,7 +114,7 @@ def test_a_monitor_without_a_lease_is_ended(store: Store, site: Site) -> None:
     # A feeder that the catalogue does not list yet is the result of a command.
     host.sites = {NAME: site, "new": site}
     catalogue.refresh()
-    asyncio.run(member_of(Shards(), catalogue)._reconcile(host, host))
+    asyncio.run(member_of(Shards(), catalogue)._reconcile(host))
     assert host.sites.keys() == {"new"}
 
 

@@ -25,6 +25,7 @@ from service.store import Store, StoreUnavailable
 from tests.codes import refused
 from tests.service.commands import command
 from tests.service.liars import FEEDER
+from tests.service.running import Outlet
 
 OTHER = "another"
 
@@ -93,6 +94,41 @@ def test_settled_follows_the_last_design_by_a_pause(
         while len(told) == 1:  # noqa: ASYNC110
             await asyncio.sleep(0.01)
         assert told[1:] == [dict.fromkeys((FEEDER, OTHER, "third", "fourth"), Phase.WATCHING)]
+        runtime.stop()
+        await task
+
+    with Store(f"sqlite:///{path}") as store:
+        asyncio.run(asyncio.wait_for(scene(store), 30.0))
+
+
+def test_readings_of_the_monitored_feeders_are_followed(site: Site, path: Path) -> None:
+    tables = called(site, "third")
+    third, fourth = (from_tables(from_json(called(site, name))) for name in ("third", "fourth"))
+
+    async def scene(store: Store) -> None:
+        outlet = Outlet()
+        runtime = Runtime(RuntimeConfig(), store, [site], given=())
+        runtime.attach(outlet)
+        task = asyncio.create_task(runtime.run())
+
+        async def follows(*names: str) -> None:
+            while outlet.followed != set(names):  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+
+        await follows(FEEDER)
+        await runtime.put_feeder("third", tables)
+        await follows(FEEDER, "third")
+        # Put again: its subscription stays.
+        await runtime.put_feeder("third", tables)
+        # A known feeder keeps its monitor; an adopted one is followed before its state is read.
+        adopting = asyncio.create_task(runtime.adopt([third, fourth]))
+        await asyncio.sleep(0)
+        assert "fourth" in outlet.followed
+        await adopting
+        await follows(FEEDER, "third", "fourth")
+        await runtime.resign(["fourth"])
+        await runtime.delete_feeder("third")
+        await follows(FEEDER)
         runtime.stop()
         await task
 

@@ -198,6 +198,7 @@ def test_a_flood_displaces_only_its_own_samples() -> None:
     assert sum(one.key.startswith("gridsec/flooded") for one in first) <= LANE_SAMPLES
     while more := box.drain(100_000):
         first += more
+    assert sum(one.key.startswith("gridsec/?") for one in first) <= LANE_SAMPLES
     # Meters beside the flooding one keep their samples; of a flood the newest stay.
     assert set(beside) <= set(first)
     assert sample("flooded", "liar", 19_999) in first

@@ -141,6 +141,38 @@ def test_a_slow_service_keeps_the_newest_and_does_not_hold_up_the_sender() -> No
     assert len(numbers) < RING + 2_000
 
 
+def test_a_flood_on_other_keys_displaces_no_sample_of_a_followed_feeder() -> None:
+    sink, slow = Sink(), threading.Event()
+
+    def take(batch: list[Sample]) -> None:
+        slow.wait(20.0)
+        sink(batch)
+
+    end = f"tcp/127.0.0.1:{free_port()}"
+    with (
+        Bus(BusConfig(listen=(end,)), "gridsec", take, max_payload=1000, lossless=False) as bus,
+        MeterClient(BusConfig("client", connect=(end,)), "gridsec") as meters,
+    ):
+        bus.follow("calm")
+        bus.follow("calm")
+        for k in range(3 * RING):
+            meters.put("stranger/meter/a/reading", b"")
+            if k % 100 == 0:
+                meters.put("calm/meter/a/reading", str(k).encode())
+        meters.put("stranger/meter/b/reading", b"last")
+        slow.set()
+        until(lambda: sink.samples and sink.samples[-1].payload == b"last")
+        calm = [int(one.payload) for one in sink.samples if one.key.startswith("gridsec/calm/")]
+        assert calm == list(range(0, 3 * RING, 100))
+        assert len(sink.samples) < 3 * RING
+        assert max(map(len, sink.batches)) <= BATCH
+        # After it the keys are those of a stranger.
+        bus.unfollow("calm")
+        meters.put("calm/meter/a/reading", b"other")
+        until(lambda: sink.samples[-1].payload == b"other")
+        assert len(sink.samples) == len(set(map(id, sink.samples)))
+
+
 def test_values_are_built_only_for_a_subscriber() -> None:
     """The service's own subscription of readings matches the keys of estimates, and is no receiver."""
     built: list[int] = []
