@@ -1,4 +1,4 @@
-"""Hostile clients of a served cluster or a single service, and observation of its feeders meanwhile."""
+"""Hostile clients and wrong clocks of a served cluster, and observation of its feeders meanwhile."""
 
 from __future__ import annotations
 
@@ -202,6 +202,50 @@ def attacks(live: ServedCluster) -> dict[str, tuple[Callable[[], AbstractContext
     for form in FORMS:
         found[form] = partial(flood, live, form, live.names[0]), live.names[1:]
     return found
+
+
+HOUR_S = 3600.0
+"""Leap of a clock, s."""
+RECOVERY_S = 10.0
+"""Longest time until every feeder is decided after an attack or a leap, s."""
+
+
+def front_leaps(live: ServedCluster, leap_s: float) -> tuple[Watch, Watch]:
+    """Feeders while the clock of the front is wrong, and after it."""
+    assert isinstance(live.front, Process)
+    live.front.leap(leap_s)
+    wrong = endure(live, 6.0)
+    live.front.leap(0.0)
+    return wrong, endure(live, 4.0)
+
+
+def worker_leaps(live: ServedCluster, worker: str, leap_s: float) -> tuple[Watch, float]:
+    """Feeders while the clock of a worker is wrong, and time after it until its feeders are decided, s."""
+    live.workers[worker].leap(leap_s)
+    # The last verdict from before the leap is valid until its age is too large.
+    time.sleep(LATE_S)
+    wrong = endure(live, 6.0)
+    its = live.owned(worker)
+    live.workers[worker].leap(0.0)
+    return wrong, live.judged_within(its, time.time(), RECOVERY_S)
+
+
+def all_leap(live: ServedCluster, leap_s: float) -> float:
+    """Shift the clocks of all processes and meters; time until all feeders are CLEAN at the new time, s."""
+    assert isinstance(live.front, Process)
+    live.fleet.ahead_s = leap_s
+    for process in (live.front, *live.workers.values()):
+        process.leap(leap_s)
+    began = time.time() + leap_s
+
+    def over() -> bool:
+        states = [live.state(name) for name in live.names]
+        return all(
+            bool(one) and began < one["t"] < began + 60.0 and one["verdict"] == "clean" for one in states
+        ) and all(one["age_s"] < LATE_S for one in states)
+
+    until(over, "verdicts after the leap", RECOVERY_S)
+    return time.time() + leap_s - began
 
 
 def log_lines(live: ServedCluster) -> int:

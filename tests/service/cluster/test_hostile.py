@@ -10,14 +10,12 @@ import pytest
 
 from feeders.model.site import Site, load
 from tests.service import hostile
-from tests.service.clusters import Process, ServedCluster, served_cluster
+from tests.service.clusters import ServedCluster, served_cluster
 from tests.service.databases import Cluster
 from tests.service.running import until
 
 pytestmark = pytest.mark.postgresql
 
-HOUR_S = 3600.0
-RECOVERY_S = 10.0
 LOG_LINES, MEMORY_MB = 200, 150.0
 """Lines of the log and private memory that an attack may cost, at most; the queues hold 64 MiB."""
 
@@ -68,7 +66,7 @@ def endured(live: ServedCluster, name: str, seconds: float) -> None:
     unharmed(cost.watch, names)
     assert cost.memory_mb < MEMORY_MB
     assert cost.lines <= LOG_LINES
-    live.judged_within(live.names, time.time(), RECOVERY_S)
+    live.judged_within(live.names, time.time(), hostile.RECOVERY_S)
     decided(live)
 
 
@@ -89,47 +87,27 @@ def test_a_flood_of_one_peer(live: ServedCluster, form: str) -> None:
 
 
 @pytest.mark.acceptance
-@pytest.mark.parametrize("leap_s", [HOUR_S, -HOUR_S])
+@pytest.mark.parametrize("leap_s", [hostile.HOUR_S, -hostile.HOUR_S])
 def test_a_leap_of_the_front_changes_no_verdict(apart: ServedCluster, leap_s: float) -> None:
-    assert isinstance(apart.front, Process)
-    apart.front.leap(leap_s)
-    found = hostile.endure(apart, 6.0)
-    unharmed(found, apart.names)
-    assert any(reason.startswith("front: clock") for reason in found.reasons)
-    apart.front.leap(0.0)
-    unharmed(hostile.endure(apart, 4.0), apart.names)
+    wrong, after = hostile.front_leaps(apart, leap_s)
+    unharmed(wrong, apart.names)
+    assert any(reason.startswith("front: clock") for reason in wrong.reasons)
+    unharmed(after, apart.names)
 
 
 @pytest.mark.acceptance
-@pytest.mark.parametrize("leap_s", [HOUR_S, -HOUR_S])
+@pytest.mark.parametrize("leap_s", [hostile.HOUR_S, -hostile.HOUR_S])
 def test_a_leap_of_one_worker_is_that_of_its_feeders(apart: ServedCluster, leap_s: float) -> None:
     its, others = apart.owned("w0"), apart.owned("w1")
-    apart.workers["w0"].leap(leap_s)
-    # The last verdict from before the leap is valid until its age is too large.
-    time.sleep(hostile.LATE_S)
-    found = hostile.endure(apart, 6.0)
-    unharmed(found, others)
-    assert [name for name in its if "clean" in found.verdicts[name]] == []
-    assert any(reason.startswith("w0: clock") for reason in found.reasons)
-    apart.workers["w0"].leap(0.0)
-    apart.judged_within(its, time.time(), RECOVERY_S)
+    wrong, _ = hostile.worker_leaps(apart, "w0", leap_s)
+    unharmed(wrong, others)
+    assert [name for name in its if "clean" in wrong.verdicts[name]] == []
+    assert any(reason.startswith("w0: clock") for reason in wrong.reasons)
 
 
 @pytest.mark.acceptance
-@pytest.mark.parametrize("leap_s", [HOUR_S, -HOUR_S])
+@pytest.mark.parametrize("leap_s", [hostile.HOUR_S, -hostile.HOUR_S])
 def test_a_leap_of_all_clocks_is_over_within_ten_seconds(apart: ServedCluster, leap_s: float) -> None:
-    assert isinstance(apart.front, Process)
     standing = apart.alarms(state="raised")
-    apart.fleet.ahead_s = leap_s
-    for process in (apart.front, *apart.workers.values()):
-        process.leap(leap_s)
-    began = time.time() + leap_s
-
-    def over() -> bool:
-        states = [apart.state(name) for name in apart.names]
-        return all(bool(one) and began < one["t"] < began + 60.0 for one in states) and all(
-            one["verdict"] == "clean" and one["age_s"] < hostile.LATE_S for one in states
-        )
-
-    until(over, "verdicts after the leap", RECOVERY_S)
+    assert hostile.all_leap(apart, leap_s) <= hostile.RECOVERY_S
     assert apart.alarms(state="raised") == standing
