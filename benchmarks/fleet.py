@@ -1,6 +1,6 @@
 """Cost of many feeders in one process: time by stage, rates of decoding, meters held at one reading a second.
 
-    python -m benchmarks.fleet [SECONDS] [MOST] [FIRST] [OTHER_TREE] [--costs] [--workers] [--arrow]
+    python -m benchmarks.fleet [SECONDS] [MOST] [FIRST] [OTHER_TREE] [--costs] [--workers] [--json] [--arrow]
 
 Feeders are copies of the Kerber suburban network, 146 meters and the busbar each. All ratios are of one run.
 
@@ -13,8 +13,8 @@ Feeders are copies of the Kerber suburban network, 146 meters and the busbar eac
    the ends, 98 % of the ticks are CLEAN, nothing is lost, the mean delay is less than 1 s, and at the end no
    feeder is shed. The number of feeders grows by half from FIRST to MOST, for 20 s each, until it is not
    held. The last number is then watched for SECONDS, and a tenth fewer until it is held. With --costs this
-   part is left out, with --arrow all but batches in Arrow. With another source tree only the processor time
-   of a reading is compared, with 8 feeders.
+   part is left out; with --json or --arrow all but it, and the other format. With another source tree only
+   the processor time of a reading is compared, with 8 feeders.
 
 The processor time of a reading is that of the service and its workers, without the database and the sender.
 """
@@ -558,19 +558,19 @@ TICK_MAX, SINGLES_MIN, BATCHES_MIN = 3.0, 0.2, 1e5
 
 def main() -> int:
     """Measure."""
-    asked = arguments(
-        __doc__, seconds=20.0, most=200, first=FIRST, against="", costs=False, workers=False, arrow=False
-    )
+    options = dict.fromkeys(("costs", "workers", "json", "arrow"), False)
+    asked = arguments(__doc__, seconds=20.0, most=200, first=FIRST, against="", **options)
     site = load(FEEDER)
     if asked.against:
         print_against(site, asked.seconds, Path(asked.against).resolve())
         return 0
-    forms = ("arrow",) if asked.arrow else ("json", "arrow")
+    both = ("json", "arrow")
+    forms = tuple(form for form in both if getattr(asked, form)) or both
     if asked.workers:
         with running_server(installed_postgresql()) as server:
             print_fleet(site, asked.seconds, range(asked.first, asked.most + 1), forms, server)
         return 0
-    if asked.arrow:
+    if asked.json or asked.arrow:
         print_fleet(site, asked.seconds, range(asked.first, asked.most + 1), forms)
         return 0
     tick = print_stages(site)

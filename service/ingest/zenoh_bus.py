@@ -292,19 +292,23 @@ class Bus:
                 first = every.handler.recv()
             except zenoh.ZError:  # the subscription is closed and drained
                 return
-            self._pass_on(_waiting(every, first))
+            self._deliver(list(self._copies(_waiting(every, first))))
 
     def _poll(self, closing: threading.Event) -> None:
-        """Deliver the samples of all subscriptions until `closing` is set; one batch of each in turn."""
+        """Deliver the samples of all subscriptions, at most `BATCH` of each, until `closing` is set."""
         while not closing.wait(POLL_S):
+            batch: list[Sample] = []
             for one in list(self._followed.values()):
-                self._pass_on(_waiting(one))
+                # Most of them are empty: the look is the cost.
+                if (first := _try_recv(one.handler)) is not None:
+                    batch += self._copies(_waiting(one, first))
             if self._others is not None:
-                self._pass_on(_waiting(self._others), self._followed)
+                batch += self._copies(_waiting(self._others), self._followed)
+            if batch:
+                self._deliver(batch)
 
-    def _pass_on(self, samples: Iterable[zenoh.Sample], left_out: Container[str] = ()) -> None:
-        """Deliver copies of the readings among some samples, except those of some feeders."""
-        batch: list[Sample] = []
+    def _copies(self, samples: Iterable[zenoh.Sample], left_out: Container[str] = ()) -> Iterator[Sample]:
+        """Copies of the readings among some samples, except those of some feeders."""
         start = len(self._prefix) + 1
         for raw in samples:
             key = str(raw.key_expr)
@@ -313,9 +317,7 @@ class Bus:
             if raw.kind == zenoh.SampleKind.DELETE:
                 self.counts.deleted += 1
             else:
-                batch.append(self._copy(raw, key))
-        if batch:
-            self._deliver(batch)
+                yield self._copy(raw, key)
 
     def _published_by_others(self, key: str) -> bool:
         """True for keys that another service with this prefix publishes."""
