@@ -78,7 +78,7 @@ def print_leaps(server: Cluster, feeders: int) -> bool:
         for leap_s in (hostile.HOUR_S, -hostile.HOUR_S):
             wrong, after = hostile.front_leaps(live, leap_s)
             changed = {*changed_of(wrong, live.names), *changed_of(after, live.names)}
-            print(f"| front | {leap_s:+.0f} | {len(changed)} | 0.0 |", flush=True)
+            print(f"| front | {leap_s:+.0f} | {len(changed)} | |", flush=True)
             others = live.owned("w1")
             wrong, over_s = hostile.worker_leaps(live, "w0", leap_s)
             changed_others = changed_of(wrong, others)

@@ -136,7 +136,8 @@ class StateCalls:
         self._workers, self._ask, self._envelope = workers, ask, envelope
         self._threads = CapacityLimiter(math.inf)
         self._tasks: dict[str, asyncio.Task[None]] = {}
-        self._refusals = Refusals("states of another version are refused")
+        self._replies = Refusals("replies of workers are refused")
+        self._refusals = Refusals("states of workers cannot be read")
 
     def follow(self, names: Collection[str]) -> None:
         """Ask exactly these workers, in the running event loop."""
@@ -147,21 +148,22 @@ class StateCalls:
 
     async def _ask_again(self, worker: str) -> None:
         while True:
-            if not await to_thread.run_sync(
-                self.ask_blocking, worker, abandon_on_cancel=True, limiter=self._threads
-            ):
+            try:
+                answered = await to_thread.run_sync(
+                    self.ask_blocking, worker, abandon_on_cancel=True, limiter=self._threads
+                )
+            except Exception as error:  # noqa: BLE001 - the worker would never be heard again
+                self._refusals.note(repr(error))
+                answered = False
+            if not answered:
                 await asyncio.sleep(AGAIN_S)
 
     def ask_blocking(self, worker: str) -> bool:
-        """Take the next state of a worker; False without one. Blocks."""
-        found = call(self._ask, self._envelope, state_key(worker), {}, STATE_S)
+        """Take the next state of a worker; False without one. Blocks. Raises KeyError for another version."""
+        found = call(self._ask, self._envelope, state_key(worker), {}, STATE_S, refusals=self._replies)
         if found is None:
             return False
-        try:
-            self._workers.take(WorkerState.of(found))
-        except (KeyError, TypeError, ValueError) as error:
-            self._refusals.note(repr(error))
-            return False
+        self._workers.take(WorkerState.of(found))
         return True
 
 
@@ -208,6 +210,7 @@ class Forwarder:
         self._workers, self._store, self._ask, self._envelope = workers, store, ask, envelope
         self._refresh = refresh
         self._given, self._names, self._max_feeders = given, names, max_feeders
+        self._replies = Refusals("replies of workers are refused")
         # The slots of each worker limit the threads.
         self._threads = CapacityLimiter(math.inf)
         self._slots: WeakValueDictionary[str, asyncio.Semaphore] = WeakValueDictionary()
@@ -302,7 +305,8 @@ class Forwarder:
 
     def ask_blocking(self, worker: str, request: Call, limit_s: float) -> Answer | None:
         """Answer of a worker; None without one. Blocks."""
-        found = call(self._ask, self._envelope, rest_key(worker), request.content(), limit_s)
+        key = rest_key(worker)
+        found = call(self._ask, self._envelope, key, request.content(), limit_s, refusals=self._replies)
         return None if found is None else Answer.of(found)
 
     # ------------------------------------------------------------------------------- the feeder of a request

@@ -209,8 +209,9 @@ class Front:
         except StoreUnavailable as error:
             self._problem = f"database: {error}"
             return
-        if self._states is not None:
-            self._states.follow(self._registered)
+        if self._states is not None and not self._stopping.is_set():
+            # After an outage of the database the leases of all workers are absent for some seconds.
+            self._states.follow({*self._registered, *(one.worker for one in self._workers.states())})
         self._problem = None
         self._read.set()
         if changes.added or changes.removed:

@@ -22,6 +22,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hmac
+import math
 import secrets
 import threading
 import time
@@ -31,6 +32,7 @@ from typing import Any, Final
 
 import cbor2
 import structlog
+from anyio import CapacityLimiter, to_thread
 from starlette.types import ASGIApp, Message
 
 from gridsec.errors import GridsecError
@@ -60,6 +62,7 @@ class Envelope:
     def __init__(self, secret: bytes, clock: Callable[[], float] = time.time) -> None:
         self._secret, self._clock = secret, clock
         self._seen: dict[str, float] = {}
+        self._lock = threading.Lock()
 
     def seal(self, purpose: str, content: Mapping[str, Any]) -> bytes:
         """Return a message. `purpose` names the key and the direction."""
@@ -83,10 +86,11 @@ class Envelope:
         return found
 
     def _refuse_repeated(self, purpose: str, number: str, now: float) -> None:
-        self._seen = {one: t for one, t in self._seen.items() if abs(now - t) <= 2.0 * FRESH_S}
-        if number in self._seen:
-            raise MessageRefused(f"{purpose}: the message is repeated")
-        self._seen[number] = now
+        with self._lock:
+            self._seen = {one: t for one, t in self._seen.items() if abs(now - t) <= 2.0 * FRESH_S}
+            if number in self._seen:
+                raise MessageRefused(f"{purpose}: the message is repeated")
+            self._seen[number] = now
 
     def _tag(self, purpose: str, body: bytes) -> bytes:
         return hmac.digest(self._secret, purpose.encode() + b"\0" + body, "sha256")
@@ -118,11 +122,13 @@ class Refusals:
         _log.warning(self._event, messages=count, latest=str(problem))
 
 
-_REPLIES = Refusals("replies of workers are refused")
+def call(
+    ask: Ask, envelope: Envelope, key: str, content: Content, limit_s: float, *, refusals: Refusals
+) -> Content | None:
+    """Content of the first valid answer to a call; None without one within the time limit. Blocks.
 
-
-def call(ask: Ask, envelope: Envelope, key: str, content: Content, limit_s: float) -> Content | None:
-    """Content of the first valid answer to a call; None without one within the time limit. Blocks."""
+    refusals: count of the other replies.
+    """
     number = secrets.token_hex(8)
     try:
         for reply in ask(key, envelope.seal(f"call {key}", {**content, "id": number}), limit_s):
@@ -131,17 +137,18 @@ def call(ask: Ask, envelope: Envelope, key: str, content: Content, limit_s: floa
                 if found["to"] == number:
                     return found
             except (MessageRefused, ValueError, KeyError, TypeError) as error:
-                _REPLIES.note(error)
+                refusals.note(error)
     except BusUnavailable:
         return None
     return None
 
 
 class CallServer:
-    """Takes the valid calls on a key, each once, to an event loop.
+    """Passes the valid calls on a key, each once, to an event loop, and their answers to the bus.
 
     key: key without the prefix.
-    take: called in the event loop with the content of a call and a function that answers it once.
+    take: called in the event loop with the content of a call and a function that answers it once, which is
+        called in the event loop, too.
     """
 
     def __init__(
@@ -153,6 +160,8 @@ class CallServer:
     ) -> None:
         self._key, self._envelope, self._loop, self._take = key, envelope, loop, take
         self._refusals = Refusals("calls of the cluster are refused")
+        self._threads = CapacityLimiter(math.inf)
+        self._replying: set[asyncio.Task[None]] = set()
 
     def __call__(self, payload: bytes, respond: Callable[[bytes], None]) -> None:
         """Take a call from any thread."""
@@ -164,7 +173,12 @@ class CallServer:
             return
 
         def answer(found: Content) -> None:
-            respond(self._envelope.seal(f"answer {self._key}", {**found, "to": content["id"]}))
+            message = self._envelope.seal(f"answer {self._key}", {**found, "to": content["id"]})
+            # A congested link blocks a reply for seconds; the event loop renews the leases.
+            reply = to_thread.run_sync(respond, message, abandon_on_cancel=True, limiter=self._threads)
+            task = self._loop.create_task(reply)
+            self._replying.add(task)
+            task.add_done_callback(self._replying.discard)
 
         self._loop.call_soon_threadsafe(self._take, content, answer)
 

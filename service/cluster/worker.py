@@ -14,7 +14,7 @@ import re
 import secrets
 import socket
 import time
-from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -323,13 +323,17 @@ async def work(
         announce(stop.set)
         _log.info("working", worker=name)
         with stop_on_signals(stop, active=signals):
-            side = (member.run(runtime), reports.run(), _note_news(runtime, news))
+            side = {
+                "leases": member.run(runtime),
+                "states": reports.run(),
+                "news": _note_news(runtime, news),
+            }
             await _until_stopped(runtime, side, stop, stopping=stopping, lost=lost)
 
 
 async def _until_stopped(
     runtime: Runtime,
-    tasks: Iterable[Coroutine[Any, Any, None]],
+    tasks: Mapping[str, Coroutine[Any, Any, None]],
     stop: asyncio.Event,
     *,
     stopping: Callable[[], None],
@@ -338,7 +342,7 @@ async def _until_stopped(
     """Run a runtime and tasks beside it until `stop`, or until one of them fails; raise its error."""
     running = asyncio.create_task(runtime.run(), name="runtime")
     stopped = asyncio.create_task(stop.wait(), name="stop")
-    side = [asyncio.create_task(one) for one in tasks]
+    side = [asyncio.create_task(run, name=name) for name, run in tasks.items()]
     supervised = asyncio.create_task(systemd.supervise(lambda: runtime.healthy()[0]), name="systemd")
     done, _ = await asyncio.wait({running, stopped, *side}, return_when=asyncio.FIRST_COMPLETED)
     errors = [error for task in done if (error := _error(task)) is not None]

@@ -12,7 +12,7 @@ import asyncio
 import contextlib
 import time
 from collections import deque
-from collections.abc import AsyncGenerator, Callable, Collection, Iterable, Mapping, Sequence, Set
+from collections.abc import AsyncGenerator, Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any, Protocol, TypeVar
@@ -97,10 +97,10 @@ class Network(Publisher, Protocol):
     """Source of readings and destination of results, such as `zenoh_bus.Bus`."""
 
     def follow(self, feeder: str) -> None:
-        """Subscribe to the readings of a feeder; idempotent."""
+        """Receive the readings of a feeder; idempotent."""
 
     def unfollow(self, feeder: str) -> None:
-        """End the subscription; idempotent."""
+        """End the effect of `follow`; idempotent."""
 
 
 class Runtime:
@@ -149,8 +149,7 @@ class Runtime:
         )
         self._prefix = f"{config.prefix}/"
         self._bus: Network | None = None
-        self._followed: Set[str] = frozenset()
-        self._expected: Set[str] = frozenset()
+        self._followed: Mapping[str, FeederMonitor] = {}
         self._dropped = 0
         self._commands: deque[tuple[Callable[[], Future[Any]], asyncio.Future[Any]]] = deque()
         self._prepared: set[asyncio.Future[tuple[Site, DesignedEstimator]]] = set()
@@ -175,10 +174,14 @@ class Runtime:
         self._bus = self._engine.committer.publisher = bus
 
     def deliver(self, batch: list[Sample]) -> int:
-        """Take samples from a receiving thread; return the number of dropped ones."""
+        """Take samples from the receiving thread; return the number of dropped ones.
+
+        Dropped samples without a feeder are no sign of overload, and are not among them.
+        """
+        before = self._inbox.surplus
         dropped = self._inbox.put(batch)
         self._engine.metrics.samples.inc(len(batch))
-        self._engine.metrics.dropped.inc(dropped)
+        self._engine.metrics.dropped.inc(dropped + self._inbox.surplus - before)
         self._dropped += dropped
         return dropped
 
@@ -219,15 +222,15 @@ class Runtime:
             self._writer.shutdown(wait=False)
 
     def _follow(self) -> None:
-        """Subscribe to the readings of exactly the monitored and the expected feeders."""
-        wanted = self._engine.monitors.keys() | self._expected
-        if self._bus is None or wanted == self._followed:
+        """Subscribe to the readings of exactly the monitored feeders."""
+        monitored = self._engine.monitors
+        if self._bus is None or monitored is self._followed:
             return
-        for name in self._followed - wanted:
+        for name in self._followed.keys() - monitored.keys():
             self._bus.unfollow(name)
-        for name in wanted - self._followed:
+        for name in monitored.keys() - self._followed.keys():
             self._bus.follow(name)
-        self._followed = wanted
+        self._followed = monitored
 
     def _design(self, monitor: FeederMonitor) -> None:
         design_jobs.begin(monitor, lambda install: self._in_loop(partial(self._hand_over, install)))
@@ -544,13 +547,7 @@ class Runtime:
 
     async def adopt(self, sites: Sequence[Site]) -> None:
         """Go on with feeders of another process as `Engine.adopt` does; their designs follow."""
-        # Readings wait in the queue while the state is read.
-        self._expected = {site.feeder.name for site in sites}
-        try:
-            self._follow()
-            await self._command(partial(self._engine.adopt, sites, self._design))
-        finally:
-            self._expected = frozenset()
+        await self._command(partial(self._engine.adopt, sites, self._design))
         self._streams.notify("state")
 
     async def resign(self, names: Collection[str]) -> None:

@@ -133,6 +133,7 @@ class Inbox:
         sample gets stale; with the wall clock the oldest samples are worthless. There is one queue then.
     feeder_of: feeder of a key; None for a key without a monitored feeder.
     shed: feeders with samples that are counted and discarded.
+    surplus: number of samples without a feeder that were dropped beyond the length of their queue.
     """
 
     def __init__(
@@ -145,6 +146,7 @@ class Inbox:
         feeder_of: Callable[[str], str | None] = lambda _: None,
     ) -> None:
         self.shed: frozenset[str] = frozenset()
+        self.surplus = 0
         self._wake = wake
         self._max_samples = max_samples
         self._max_bytes = max_bytes
@@ -172,7 +174,7 @@ class Inbox:
             return {name: lane.offered for name, lane in self._lanes.items() if name is not None}
 
     def put(self, batch: list[Sample]) -> int:
-        """Add samples; called from any thread. Returns the number of dropped samples."""
+        """Add samples; called from any thread. Returns the number of dropped ones beside the surplus."""
         dropped = 0
         with self._room:
             for sample in batch:
@@ -194,7 +196,7 @@ class Inbox:
                 self._length += 1
                 self._bytes += size
                 if name is None and not self._lossless and len(lane.waiting) > LANE_SAMPLES:
-                    dropped += self._drop(lane)
+                    self.surplus += self._drop(lane)
                 while self._length > 1 and self._full(0):
                     dropped += self._drop(max(self._lanes.values(), key=lambda one: one.bytes))
         self._wake()

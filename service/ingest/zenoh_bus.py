@@ -12,11 +12,11 @@ import json
 import re
 import threading
 import time
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from itertools import chain, islice
-from typing import Any
+from typing import Any, TypeAlias
 
 import structlog
 import zenoh
@@ -37,7 +37,7 @@ from service.ingest.queues import (
 RING = 8192
 """Capacity of a subscription's queue, samples."""
 POLL_S = 0.02
-"""Pause between two looks at the queues of single feeders, s.
+"""Pause between two looks at the queues, s.
 
 A thread that waits for one queue wakes ten times a second and takes the interpreter's lock: hundreds of them
 stop the others.
@@ -177,6 +177,11 @@ def tls_files(config: BusConfig) -> dict[str, str]:
     }
 
 
+_Handler: TypeAlias = "zenoh.handlers.Handler[zenoh.Sample]"
+_Subscription: TypeAlias = "tuple[zenoh.Subscriber[Any], _Handler]"
+"""A subscription and its queue, which remains readable after its end."""
+
+
 class Bus:
     """zenoh session of the service, as a context manager.
 
@@ -207,8 +212,8 @@ class Bus:
     ) -> None:
         self._wall, self._missed, self._everything = wall, missed, everything
         self._live: zenoh.Session | None = None
-        self._followed: dict[str, zenoh.Subscriber[Any]] = {}
-        self._others: zenoh.Subscriber[Any] | None = None
+        self._followed: dict[str, _Subscription] = {}
+        self._others: _Subscription | None = None
         self._closing = threading.Event()
         self._config = config
         self._prefix = prefix
@@ -229,10 +234,10 @@ class Bus:
             live = self._live = stack.enter_context(session(self._config))
             if self._everything:
                 # Its pattern also matches wrong keys.
-                others = self._others = self._subscribe(live, "**")
-                stack.callback(others.undeclare)
-            if self._lossless:
-                self._start("zenoh readings", self._receive, self._others)
+                self._others = self._subscribe(live, "**")
+                stack.callback(self._others[0].undeclare)
+            if self._lossless and self._others is not None:
+                self._start("zenoh readings", self._receive, self._others[1])
             else:
                 self._start("zenoh readings", self._poll, self._closing)
                 stack.callback(self._closing.set)
@@ -268,51 +273,62 @@ class Bus:
 
     # ---------------------------------------------------------------- in
 
-    def _subscribe(self, live: zenoh.Session, pattern: str) -> zenoh.Subscriber[Any]:
+    def _subscribe(self, live: zenoh.Session, pattern: str) -> _Subscription:
         """Subscribe to readings; one subscription for all kinds of readings keeps their order."""
         # A full ring drops the oldest samples; the gap shows in the sequence numbers.
         ring: Any = zenoh.handlers.FifoChannel(RING) if self._lossless else zenoh.handlers.RingChannel(RING)
         remote = zenoh.Locality.REMOTE
-        return live.declare_subscriber(f"{self._prefix}/{pattern}", ring, allowed_origin=remote)
+        made = live.declare_subscriber(f"{self._prefix}/{pattern}", ring, allowed_origin=remote)
+        return made, made.handler
 
     def follow(self, feeder: str) -> None:
-        """Receive the keys of one feeder; idempotent. With `lossless` one queue keeps the order of all."""
+        """Receive the keys of one feeder; idempotent. With `lossless` one queue keeps the order of all.
+
+        Samples that wait in the queue of all other keys at this moment are discarded.
+        """
         if not self._lossless and feeder not in self._followed:
             self._followed[feeder] = self._subscribe(self._session(), f"{feeder}/**")
 
     def unfollow(self, feeder: str) -> None:
         """End the effect of `follow`; idempotent."""
         if (made := self._followed.pop(feeder, None)) is not None:
-            made.undeclare()  # type: ignore[no-untyped-call]
+            made[0].undeclare()  # type: ignore[no-untyped-call]
 
-    def _receive(self, every: zenoh.Subscriber[Any]) -> None:
+    def _receive(self, handler: _Handler) -> None:
         """Deliver the samples of one subscription until it ends."""
         while True:
             try:
-                first = every.handler.recv()
+                first = handler.recv()
             except zenoh.ZError:  # the subscription is closed and drained
                 return
-            self._deliver(list(self._copies(_waiting(every, first))))
+            self._deliver(list(self._copies(_waiting(handler, first), None)))
 
     def _poll(self, closing: threading.Event) -> None:
-        """Deliver the samples of all subscriptions, at most `BATCH` of each, until `closing` is set."""
+        """Deliver the samples of all subscriptions, `BATCH` of each in turn, until `closing` is set."""
         while not closing.wait(POLL_S):
             batch: list[Sample] = []
-            for one in list(self._followed.values()):
+            for feeder, (_, handler) in list(self._followed.items()):
                 # Most of them are empty: the look is the cost.
-                if (first := _try_recv(one.handler)) is not None:
-                    batch += self._copies(_waiting(one, first))
+                if (first := _try_recv(handler)) is not None:
+                    batch += self._copies(_waiting(handler, first), feeder)
+                if len(batch) >= BATCH:
+                    self._deliver(batch)
+                    batch = []
             if self._others is not None:
-                batch += self._copies(_waiting(self._others), self._followed)
+                batch += self._copies(_waiting(self._others[1]), None)
             if batch:
                 self._deliver(batch)
 
-    def _copies(self, samples: Iterable[zenoh.Sample], left_out: Container[str] = ()) -> Iterator[Sample]:
-        """Copies of the readings among some samples, except those of some feeders."""
+    def _copies(self, samples: Iterable[zenoh.Sample], feeder: str | None) -> Iterator[Sample]:
+        """Copies of the readings among some samples, with keys of one feeder, or None: of no followed one.
+
+        A put on a pattern of keys is in the queues of all feeders that it matches.
+        """
         start = len(self._prefix) + 1
         for raw in samples:
             key = str(raw.key_expr)
-            if key[start:].partition("/")[0] in left_out or self._published_by_others(key):
+            of = key[start:].partition("/")[0]
+            if (of in self._followed if feeder is None else of != feeder) or self._published_by_others(key):
                 continue
             if raw.kind == zenoh.SampleKind.DELETE:
                 self.counts.deleted += 1
@@ -485,7 +501,9 @@ class Bus:
     def ask(self, key: str, payload: bytes, timeout_s: float) -> Iterator[bytes]:
         """Query a key, without the prefix, and yield the payload of each reply as it arrives. Blocks.
 
-        All queryables are asked, and each reply counts: a false one replaces no other. Raises BusUnavailable.
+        All queryables are asked, and each reply counts: a false one replaces no other. A queryable that does
+        not end the query keeps it open in zenoh until `timeout_s`, also after the last reply that is read.
+        Raises BusUnavailable.
         """
         try:
             replies = self._session().get(
@@ -511,7 +529,10 @@ def _serve(
         except zenoh.ZError:
             return
         given = query.payload
-        answer(b"" if given is None else given.to_bytes(), partial(_respond, query))
+        try:
+            answer(b"" if given is None else given.to_bytes(), partial(_respond, query))
+        except Exception:  # noqa: BLE001 - the next queries are answered
+            _log.exception("a query could not be answered", key=str(query.key_expr))
 
 
 def _respond(query: zenoh.Query, payload: bytes) -> None:
@@ -572,15 +593,15 @@ def _refuse(query: zenoh.Query, problem: str) -> None:
         query.reply_err(json.dumps({"detail": problem}), encoding=JSON)
 
 
-def _waiting(subscriber: zenoh.Subscriber[Any], *first: zenoh.Sample) -> Iterator[zenoh.Sample]:
-    """Some samples and those that wait in the queue of a subscription behind them, up to `BATCH` together."""
-    return islice(chain(first, iter(partial(_try_recv, subscriber.handler), None)), BATCH)
+def _waiting(handler: _Handler, *first: zenoh.Sample) -> Iterator[zenoh.Sample]:
+    """Some samples and those that wait in a queue behind them, up to `BATCH` together."""
+    return islice(chain(first, iter(partial(_try_recv, handler), None)), BATCH)
 
 
 def _try_recv(handler: zenoh.handlers.Handler[zenoh.Sample]) -> zenoh.Sample | None:
     try:
         return handler.try_recv()
-    except zenoh.ZError:  # closed and drained; the next blocking receive ends the thread
+    except zenoh.ZError:  # the subscription is closed, and its queue is empty
         return None
 
 

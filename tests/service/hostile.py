@@ -28,9 +28,11 @@ KEPT = 8
 """Descriptors that may remain: connections of the database and of readers."""
 KINDS = {"single": (), "workers": ("--workers", "2")}
 """Options of `gridsec serve`: one process, or a front with workers."""
-FORMS = ("garbage", "oversized", "stranger", "call", "answer")
-"""Kinds of floods: text that is not JSON, payloads above the limit, keys without a feeder, and without the
-secret of the cluster calls of a worker and answers in its place, which keep the calls open."""
+FORMS = ("garbage", "oversized", "stranger", "wildcard")
+"""Floods of readings: no JSON, payloads above the limit, keys without a feeder, a pattern of keys."""
+FORGERIES = ("call", "answer")
+"""Kinds of floods between front and workers without the secret of the cluster: calls of a worker, and answers
+in its place that keep the calls open."""
 FLOOD = """
 import collections, itertools, sys
 from service.ingest.queues import BusConfig
@@ -45,6 +47,8 @@ with session(BusConfig("client", connect=(sys.argv[1],))) as live:
             live.put(f"gridsec/{feeder}/meter/m01/reading", bytes(400_000))
         elif form == "stranger":
             live.put(f"gridsec/stranger-{number}/meter/m01/reading", b"{}")
+        elif form == "wildcard":
+            live.put("gridsec/*/meter/m01/reading", b"{}")
         elif form == "call":
             kind = "state" if number % 2 else "rest"
             live.get(f"gridsec/@worker/{worker}/{kind}", payload=b"0" * 200, timeout=1.0)
@@ -148,7 +152,7 @@ def stalled_streams(live: ServedCluster, number: int) -> Iterator[None]:
 
 @contextmanager
 def flood(live: ServedCluster, form: str, feeder: str) -> Iterator[None]:
-    """A peer that publishes as fast as it can, as a process of its own."""
+    """A peer that publishes, calls or answers as fast as it can, as a process of its own."""
     worker = live.owners().get(feeder) or "w0"
     peer = subprocess.Popen(
         [sys.executable, "-c", FLOOD, live.zenoh, form, feeder, worker],
@@ -199,7 +203,7 @@ def attacks(live: ServedCluster) -> dict[str, tuple[Callable[[], AbstractContext
         "connections": (partial(idle_connections, live, CONNECTIONS), live.names),
         "streams": (partial(stalled_streams, live, STREAMS), live.names),
     }
-    for form in FORMS:
+    for form in FORMS + (FORGERIES if live.owners() else ()):
         found[form] = partial(flood, live, form, live.names[0]), live.names[1:]
     return found
 

@@ -87,6 +87,13 @@ def test_a_flood_of_one_peer(live: ServedCluster, form: str) -> None:
 
 
 @pytest.mark.acceptance
+@pytest.mark.parametrize("live", ["workers"], indirect=True)
+@pytest.mark.parametrize("form", hostile.FORGERIES)
+def test_a_flood_between_front_and_workers(live: ServedCluster, form: str) -> None:
+    endured(live, form, 10.0)
+
+
+@pytest.mark.acceptance
 @pytest.mark.parametrize("leap_s", [hostile.HOUR_S, -hostile.HOUR_S])
 def test_a_leap_of_the_front_changes_no_verdict(apart: ServedCluster, leap_s: float) -> None:
     wrong, after = hostile.front_leaps(apart, leap_s)

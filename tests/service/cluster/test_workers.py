@@ -22,6 +22,7 @@ from service.cluster.messages import (
     CallServer,
     Entry,
     Envelope,
+    Refusals,
     StateReports,
     WorkerState,
     call,
@@ -117,10 +118,20 @@ def test_the_age_of_a_tick_includes_the_time_since_the_state() -> None:
 class Line:
     """The way from a front to the worker `w0`, with false replies before the answer."""
 
-    def __init__(self, server: CallServer, loop: asyncio.AbstractEventLoop) -> None:
-        self.server, self.loop = server, loop
+    def __init__(self) -> None:
+        self.now = 1e9
+        self.key = state_key("w0")
+        self.loop = asyncio.new_event_loop()
+        self.states = Heard()
+        self.server = CallServer(self.key, self.envelope(), self.loop, self.take)
         self.false: list[bytes] = []
         self.kept: list[bytes] = []
+
+    def envelope(self, secret: bytes = b"secret") -> Envelope:
+        return Envelope(secret, lambda: self.now)
+
+    def take(self, _: object, answer: Callable[[dict[str, Any]], None]) -> None:
+        answer(self.states.state("w0", 1).content())
 
     def ask(self, _: str, payload: bytes, limit_s: float) -> Iterator[bytes]:
         yield from self.false
@@ -132,46 +143,50 @@ class Line:
 
 @pytest.fixture
 def line() -> Iterator[Line]:
-    """A worker that answers each call with the state of one feeder, or fails."""
-    loop = asyncio.new_event_loop()
-    heard, key = Heard(), state_key("w0")
-
-    def take(_: object, answer: Callable[[dict[str, Any]], None]) -> None:
-        answer(heard.state("w0", 1).content())
-
-    thread = threading.Thread(target=loop.run_forever, daemon=True)
+    """A worker that answers each call with the state of one feeder."""
+    made = Line()
+    thread = threading.Thread(target=made.loop.run_forever, daemon=True)
     thread.start()
-    yield Line(CallServer(key, Envelope(b"secret"), loop, take), loop)
-    loop.call_soon_threadsafe(loop.stop)
+    yield made
+    made.loop.call_soon_threadsafe(made.loop.stop)
     thread.join(5.0)
-    loop.close()
+    made.loop.close()
 
 
 def test_false_replies_hide_no_state(line: Line) -> None:
-    workers, envelope = Workers(), Envelope(b"secret")
+    workers, envelope, answer = Workers(), line.envelope(), f"answer {line.key}"
     calls = StateCalls(workers, line.ask, envelope)
     assert calls.ask_blocking("w0")
-    # Also an answer to an earlier call is none to this one.
-    answer, key = f"answer {state_key('w0')}", state_key("w0")
-    line.false = [b"", Envelope(b"guess").seal(answer, {"to": ""}), envelope.seal(answer, {}), *line.kept]
+    # An answer to an earlier call is none to this one.
+    line.false = [
+        b"",
+        line.envelope(b"guess").seal(answer, {"to": ""}),
+        envelope.seal(answer, {}),
+        *line.kept,
+    ]
     with capture_logs() as lines:
         assert calls.ask_blocking("w0")
     assert [entry["log_level"] for entry in lines] == ["warning"]
     assert workers.states()[0].order == (1, 2)
-    assert call(line.ask, Envelope(b"guess"), key, {}, 0.2) is None
+    assert call(line.ask, line.envelope(b"guess"), line.key, {}, 0.2, refusals=Refusals("")) is None
 
 
-def test_a_state_of_another_version_is_refused_with_a_line_of_the_log() -> None:
-    envelope, key = Envelope(b"secret"), state_key("w0")
-
-    def ask(_: str, payload: bytes, __: float) -> list[bytes]:
-        return [envelope.seal(f"answer {key}", {"to": envelope.open(f"call {key}", payload)["id"]})]
-
+@pytest.mark.parametrize("leap_s", [3600.0, -3600.0, -10.0])
+def test_a_leap_of_the_clock_of_the_database_silences_no_worker(line: Line, leap_s: float) -> None:
     workers = Workers()
-    with capture_logs() as lines:
-        assert not StateCalls(workers, ask, envelope).ask_blocking("w0")
-    assert [entry["event"] for entry in lines] == ["states of another version are refused"]
-    assert workers.states() == []
+    calls = StateCalls(workers, line.ask, line.envelope())
+    assert calls.ask_blocking("w0")
+    line.now += leap_s
+    assert calls.ask_blocking("w0")
+    assert workers.states()[0].order == (1, 2)
+
+
+def test_a_blocked_reply_does_not_hold_up_the_event_loop(line: Line) -> None:
+    goes_on = threading.Event()
+    line.server(line.envelope().seal(f"call {line.key}", {}), lambda _: bool(goes_on.wait(20.0)))
+    workers = Workers()
+    assert StateCalls(workers, line.ask, line.envelope()).ask_blocking("w0")
+    goes_on.set()
 
 
 def test_the_live_workers_are_asked_and_no_others(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,7 +195,9 @@ def test_the_live_workers_are_asked_and_no_others(monkeypatch: pytest.MonkeyPatc
 
     def ask(key: str, _: bytes, __: float) -> list[bytes]:
         asked.append(key)
-        raise BusUnavailable("zenoh query: no session", code="query-failed")
+        if len(asked) % 2:
+            raise BusUnavailable("zenoh query: no session", code="query-failed")
+        raise RuntimeError("no thread")
 
     async def keys(calls: StateCalls, *names: str) -> set[str]:
         """Asked keys while these workers are live."""
@@ -206,7 +223,7 @@ def test_a_flood_of_forged_calls_has_one_line_of_the_log(line: Line) -> None:
             line.server(b"0" * 200, replies.append)
     assert replies == [b""] * 1000
     assert [(entry["messages"], entry["log_level"]) for entry in lines] == [(1, "warning")]
-    assert StateCalls(Workers(), line.ask, Envelope(b"secret")).ask_blocking("w0")
+    assert StateCalls(Workers(), line.ask, line.envelope()).ask_blocking("w0")
 
 
 @pytest.mark.parametrize(

@@ -166,11 +166,53 @@ def test_a_flood_on_other_keys_displaces_no_sample_of_a_followed_feeder() -> Non
         assert calm == list(range(0, 3 * RING, 100))
         assert len(sink.samples) < 3 * RING
         assert max(map(len, sink.batches)) <= 2 * BATCH
-        # After it the keys are those of a stranger.
+        # After it the keys are those of a stranger. A pattern of keys counts once.
         bus.unfollow("calm")
         meters.put("calm/meter/a/reading", b"other")
-        until(lambda: sink.samples[-1].payload == b"other")
-        assert len(sink.samples) == len(set(map(id, sink.samples)))
+        meters.put("*/meter/a/reading", b"pattern")
+        until(lambda: sink.samples[-1].payload == b"pattern")
+        assert [one.payload for one in sink.samples[-2:]] == [b"other", b"pattern"]
+
+
+def test_a_look_at_many_full_queues_is_delivered_in_parts() -> None:
+    sink, feeders = Sink(), [f"f{k}" for k in range(5)]
+    with pair(sink) as (bus, meters, _):
+        for feeder in feeders:
+            bus.follow(feeder)
+        for k in range(2 * BATCH):
+            for feeder in feeders:
+                meters.put(f"{feeder}/meter/a/reading", str(k).encode())
+        meters.put("*/meter/a/reading", b"pattern")
+        until(lambda: len(sink.samples) > 10 * BATCH)
+        until(lambda: sink.samples[-1].payload == b"pattern")
+    for feeder in feeders:
+        own = [int(one.payload) for one in sink.samples if one.key.startswith(f"gridsec/{feeder}/")]
+        assert own == list(range(2 * BATCH))
+    assert [one.key for one in sink.samples].count("gridsec/*/meter/a/reading") == 1
+    assert max(map(len, sink.batches)) < 3 * BATCH
+
+
+def test_changes_of_the_followed_feeders_end_no_reception() -> None:
+    sink, ended = Sink(), threading.Event()
+    with pair(sink) as (bus, meters, _):
+
+        def put() -> None:
+            while not ended.is_set():
+                for feeder in ("a", "b"):
+                    meters.put(f"{feeder}/meter/a/reading", b"")
+
+        flood = threading.Thread(target=put)
+        flood.start()
+        for _ in range(300):
+            for feeder in ("a", "b"):
+                bus.follow(feeder)
+            time.sleep(0.001)
+            for feeder in ("b", "a"):
+                bus.unfollow(feeder)
+        ended.set()
+        flood.join()
+        meters.put("last/meter/a/reading", b"last")
+        until(lambda: sink.samples and sink.samples[-1].payload == b"last")
 
 
 def test_values_are_built_only_for_a_subscriber() -> None:
