@@ -25,6 +25,7 @@ import json
 import math
 import multiprocessing
 import os
+import re
 import sys
 import tempfile
 import threading
@@ -35,7 +36,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import cbor2
 import pyarrow as pa
@@ -433,12 +434,41 @@ class Fleet(threading.Thread):
 OWN = Path(__file__).parents[1]
 
 
+class Spent(NamedTuple):
+    """Processor time of a process, its threads and its living children, s."""
+
+    zenoh: float  # threads of zenoh
+    others: float
+
+
 def spent_s(process: int) -> float:
     """Processor time of a process, all its threads and its living children, s."""
-    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-    children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
-    own = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-    return own + sum(spent_s(int(one)) for one in children)
+    return sum(spent_by(process))
+
+
+def spent_by(process: int) -> Spent:
+    """The same by threads."""
+    home = Path(f"/proc/{process}")
+    zenoh = 0.0
+    for task in home.glob("task/*/stat"):
+        name, _, fields = task.read_text().partition("(")[2].rpartition(")")
+        zenoh += _time_s(fields) if ZENOH.match(name) else 0.0
+    # Ended threads count with the others.
+    others = _time_s((home / "stat").read_text().rpartition(")")[2]) - zenoh
+    for child in (home / "task" / str(process) / "children").read_text().split():
+        more = spent_by(int(child))
+        zenoh, others = zenoh + more.zenoh, others + more.others
+    return Spent(zenoh, others)
+
+
+def _time_s(fields: str) -> float:
+    """Processor time by the fields behind the name in a file `stat`, s."""
+    user, system = fields.split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
+ZENOH: Final = re.compile(r"(rx|tx|net|acc|app)-\d")
+"""Names of the threads of zenoh's runtimes."""
 
 
 def _most_shed(service: Service, end: float) -> int:
@@ -463,6 +493,15 @@ def _settle(service: Service, number: int) -> None:
         before, begun = after, time.monotonic()
 
 
+class Held(NamedTuple):
+    """A fleet during a time."""
+
+    held: bool
+    cost_s: float  # processor time for a reading, s
+    zenoh_s: float  # part of it in the threads of zenoh, s
+    text: str  # a line of figures
+
+
 def holds(
     site: Site,
     folder: Path,
@@ -472,8 +511,8 @@ def holds(
     seconds: float,
     tree: Path = OWN,
     server: Server | None = None,
-) -> tuple[bool, float, str]:
-    """True if that many feeders are held; processor time for a reading, s; a line of figures."""
+) -> Held:
+    """Start a service with a number of feeders, and watch them for a time, s."""
     names = [f"feeder-{k:04d}" for k in range(number)]
     place = Path(tempfile.mkdtemp(prefix=f"{tree.name}-{form}-{number}-", dir=folder))
     tables = {name: renamed(site.tables, name) for name in names}
@@ -493,9 +532,9 @@ def holds(
         try:
             _settle(service, number)
             fleet.behind_s = 0.0
-            before, begun, spent = metrics(service), time.monotonic(), spent_s(service.process.pid)
+            before, begun, spent = metrics(service), time.monotonic(), spent_by(service.process.pid)
             most = _most_shed(service, begun + seconds)
-            cost = spent_s(service.process.pid) - spent
+            after_s = spent_by(service.process.pid)
             after, lasted = metrics(service), time.monotonic() - begun
         finally:
             fleet.ended.set()
@@ -513,8 +552,10 @@ def holds(
         f", {share:.3f} of them clean, {lost:.0f} lost, at most {most} shed at a look, {shed:.0f} at the end"
     )
     text += f", mean delay {delay:.2f} s, sender behind by {max(0.0, fleet.behind_s):.2f} s"
-    cost /= max(1.0, more["gridsec_readings_total"])
-    return held, cost, f"{text}, {1e6 * cost:.1f} us for a reading"
+    readings = max(1.0, more["gridsec_readings_total"])
+    zenoh_s, others_s = ((now - then) / readings for now, then in zip(after_s, spent, strict=True))
+    cost_s = zenoh_s + others_s
+    return Held(held, cost_s, zenoh_s, f"{text}, {1e6 * cost_s:.1f} us for a reading")
 
 
 def print_against(site: Site, seconds: float, tree: Path) -> None:
@@ -523,9 +564,9 @@ def print_against(site: Site, seconds: float, tree: Path) -> None:
         for form in ("json", "arrow"):
             costs = []
             for one in (tree, OWN):
-                _, cost, text = holds(site, Path(folder), FIRST, form, seconds=seconds, tree=one)
-                costs.append(cost)
-                print(f"{one}: {text}", flush=True)
+                found = holds(site, Path(folder), FIRST, form, seconds=seconds, tree=one)
+                costs.append(found.cost_s)
+                print(f"{one}: {found.text}", flush=True)
             print(
                 f"{form}: processor time for a reading, ratio to {tree}: {costs[1] / costs[0]:.2f}",
                 flush=True,
@@ -539,9 +580,9 @@ def print_fleet(
     with tempfile.TemporaryDirectory() as folder:
 
         def held(form: str, number: int, lasting_s: float) -> bool:
-            good, _, text = holds(site, Path(folder), number, form, seconds=lasting_s, server=server)
-            print(f"{lasting_s:.0f} s, {'held' if good else 'not held'}: {text}", flush=True)
-            return good
+            found = holds(site, Path(folder), number, form, seconds=lasting_s, server=server)
+            print(f"{lasting_s:.0f} s, {'held' if found.held else 'not held'}: {found.text}", flush=True)
+            return found.held
 
         for form in forms:
             best = number = numbers.start

@@ -63,7 +63,8 @@ export class Incidents {
     this.onPick = onPick;
     this.found = [];
     this.items = new Map();
-    this.open = new Map(); // Alarms and events of expanded incidents.
+    this.open = new Map(); // Alarms and events of expanded incidents, with the incident that they belong to.
+    this.requests = new Map(); // Number of the latest request for them.
     this.chosen = new Set(); // Selected incidents.
     this.feeder = null;
     this.limit = PAGE;
@@ -130,18 +131,21 @@ export class Incidents {
   }
 
   async list(found) {
-    const before = new Map(this.found.map((one) => [one.id, JSON.stringify(one)]));
     this.found = found;
-    await Promise.all(found.filter((one) => this.open.has(one.id) && before.get(one.id) !== JSON.stringify(one)).map((one) => this.details(one.id)));
+    await Promise.all(found.filter((one) => this.open.has(one.id) && this.open.get(one.id)?.of !== JSON.stringify(one)).map((one) => this.details(one.id)));
     this.render();
   }
 
   async details(id) {
+    const number = (this.requests.get(id) ?? 0) + 1;
+    this.requests.set(id, number);
+    const of = JSON.stringify(this.found.find((one) => one.id === id));
     const [{ alarms, next }, { events }] = await Promise.all([
       getJson(`${API}/alarms?${new URLSearchParams({ incident: id, limit: ALARMS_SHOWN, sort: "severity" })}`),
       getJson(`${API}/incidents/${id}/events?limit=1000`),
     ]);
-    if (this.open.has(id)) this.open.set(id, { alarms, more: next !== null, events });
+    // The response to an earlier request may come after that to a later one.
+    if (this.open.has(id) && this.requests.get(id) === number) this.open.set(id, { of, alarms, more: next !== null, events });
   }
 
   // Select incidents: ids of others are dropped.

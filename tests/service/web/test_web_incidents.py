@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import APIResponse, Page, Route, expect
 
 from tests.service.asking import T0
 from tests.service.looking import Site
@@ -35,6 +36,27 @@ def fill(page: Page, text: str, **more: str) -> None:
 
 def fits(page: Page, size: dict[str, int]) -> None:
     assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
+
+
+def test_a_late_response_to_an_earlier_request_changes_no_alarm(site: Site) -> None:
+    site.service.wall = lambda: T0 + 10
+    site.tick(T0, 4, lies=LIES)
+    page = site.open(WIDE)
+    held: list[tuple[Route, APIResponse]] = []
+    alarms = re.compile(r"/alarms\?incident=")
+    page.route(alarms, lambda route: route.continue_() if held else held.append((route, route.fetch())))
+    one = line(page)
+    with page.expect_request(alarms):
+        one.locator(".line").click()
+    page.keyboard.press("a")
+    fill(page, "van sent")
+    acknowledged = one.locator('.alarm[data-state="acknowledged"]')
+    expect(acknowledged).to_have_count(3)
+    route, response = held[0]
+    with page.expect_response(alarms):
+        route.fulfill(response=response)
+    page.wait_for_timeout(300)
+    expect(acknowledged).to_have_count(3)
 
 
 def test_one_line_for_an_attack_and_actions_by_keyboard(site: Site) -> None:
