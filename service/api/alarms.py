@@ -194,8 +194,10 @@ def list_alarms(  # one argument per query parameter
     """A page of alarms; `since` and `until` refer to `t_raised`."""
     _within(caller, feeder)
     store = backend.store
-    last_event, changes = store.last_event, f"{store.last_incident_event}-{store.suppression_changes}"
-    # Before the page is read: changes stored in between are in the page.
+    # Before the page is read: changes stored in between are in the page. By the database: another request may
+    # have shown a change of which this process does not know yet.
+    last_event, last_incident_event = store.newest()
+    changes = f"{last_incident_event}-{store.suppression_changes}"
     unstored, trouble = backend.unstored()
     # Event numbers identify changes within one database, and a run has only one.
     scope = _scope(caller)

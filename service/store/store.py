@@ -498,11 +498,18 @@ class Store(Reader):
 
     def refresh(self) -> None:
         """Read `last_event` and `last_incident_event`: other processes add events, too."""
+        newest, newest_incident = self.newest()
+        self._last_event = max(self._last_event, newest)
+        self._last_incident_event = max(self._last_incident_event, newest_incident)
+
+    def newest(self) -> tuple[int, int]:
+        """Return the numbers of the newest events of alarms and incidents in the database.
+
+        A reader of the database sees a commit earlier than `last_event` has its number.
+        """
         with self._read() as connection:
-            newest = connection.scalar(sa.select(sa.func.max(EVENT.c.seq)))
-            newest_incident = connection.scalar(sa.select(sa.func.max(INCIDENT_EVENT.c.seq)))
-        self._last_event = max(self._last_event, newest or 0)
-        self._last_incident_event = max(self._last_incident_event, newest_incident or 0)
+            found = [connection.scalar(sa.select(sa.func.max(one.c.seq))) for one in (EVENT, INCIDENT_EVENT)]
+        return found[0] or 0, found[1] or 0
 
     def outbox_pending(self, limit: int = 1000, *, after: int = 0) -> list[AlarmEvent]:
         """Return the unpublished events of the feeders of this process, as `Reader.outbox_pending`."""

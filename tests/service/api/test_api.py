@@ -256,6 +256,16 @@ def test_the_list_is_not_sent_twice(setup: Setup) -> None:
     assert setup.get("/alarms", headers=header).status_code == 200
 
 
+def test_the_list_is_sent_again_before_the_process_knows_of_a_commit(setup: Setup) -> None:
+    header = {"If-None-Match": setup.get("/alarms").headers["etag"]}
+    store = setup.service.store
+    before = store._last_event, store._last_incident_event
+    setup.attack()
+    # A commit is visible to readers earlier than to the properties of the store.
+    store._last_event, store._last_incident_event = before
+    assert setup.get("/alarms", headers=header).status_code == 200
+
+
 def test_the_events_of_an_alarm_come_page_by_page(setup: Setup) -> None:
     for k in range(4):
         setup.attack(T0 + 12 * k)
