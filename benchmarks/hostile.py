@@ -15,22 +15,16 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks._arguments import arguments
 from feeders.model.site import load
 from tests.service import hostile
-from tests.service.clusters import ServedCluster, served_cluster
+from tests.service.clusters import served_cluster
 from tests.service.databases import Cluster, installed_postgresql, running
 from tests.service.running import until
 
 FEEDER = "cigre-lv"
-
-
-def decided(live: ServedCluster) -> None:
-    """Wait until every feeder is displayed as clean."""
-    until(lambda: {one["status"] for one in live.listed().values()} == {"clean"}, "verdicts")
 
 
 def print_attacks(server: Cluster, seconds: float, feeders: int) -> bool:
@@ -45,24 +39,18 @@ def print_attacks(server: Cluster, seconds: float, feeders: int) -> bool:
                 *(Path(folder), server.database(), load(FEEDER), feeders, 0), options=options
             ) as live,
         ):
-            until(lambda: live.http.get("/readyz").status_code == 200, "readiness")
-            decided(live)
+            hostile.decided(live)
             for name, (attack, names) in hostile.attacks(live).items():
                 cost = hostile.attacked(live, attack(), seconds)
                 watch, late = cost.watch, cost.watch.late(names)
                 age_s = max(watch.ages_s.get(name, float("inf")) for name in names)
-                changed = changed_of(watch, names)
+                changed = watch.changed(names)
                 counts = f"{len(late)} | {len(changed)} | {len(watch.failed)}"
                 cells = f"{watch.slowest_s:.2f} | {age_s:.1f} | {counts}"
                 print(f"| {kind} | {name} | {cells} | {cost.memory_mb:+.1f} | {cost.lines} |", flush=True)
                 missed |= bool(late or changed or watch.failed)
-                decided(live)
+                hostile.decided(live)
     return missed
-
-
-def changed_of(watch: hostile.Watch, names: Sequence[str]) -> list[str]:
-    """Feeders that were not CLEAN all the time."""
-    return [name for name in names if watch.verdicts.get(name) != {"clean"}]
 
 
 def print_leaps(server: Cluster, feeders: int) -> bool:
@@ -74,17 +62,17 @@ def print_leaps(server: Cluster, feeders: int) -> bool:
         served_cluster(Path(folder), server.database(), load(FEEDER), feeders, 2) as live,
     ):
         until(lambda: set(live.owners().values()) == {"w0", "w1"}, "the distribution")
-        decided(live)
+        hostile.decided(live)
         for leap_s in (hostile.HOUR_S, -hostile.HOUR_S):
             wrong, after = hostile.front_leaps(live, leap_s)
-            changed = {*changed_of(wrong, live.names), *changed_of(after, live.names)}
+            changed = {*wrong.changed(live.names), *after.changed(live.names)}
             print(f"| front | {leap_s:+.0f} | {len(changed)} | |", flush=True)
             others = live.owned("w1")
             wrong, over_s = hostile.worker_leaps(live, "w0", leap_s)
-            changed_others = changed_of(wrong, others)
+            changed_others = wrong.changed(others)
             print(f"| one worker | {leap_s:+.0f} | {len(changed_others)} | {over_s:.1f} |", flush=True)
             missed |= bool(changed or changed_others)
-            decided(live)
+            hostile.decided(live)
         for ahead_s in (hostile.HOUR_S, 0.0):
             leap_s = ahead_s - live.fleet.ahead_s
             over_s = hostile.all_leap(live, ahead_s)

@@ -598,7 +598,7 @@ def _waiting(handler: _Handler, *first: zenoh.Sample) -> Iterator[zenoh.Sample]:
     return islice(chain(first, iter(partial(_try_recv, handler), None)), BATCH)
 
 
-def _try_recv(handler: zenoh.handlers.Handler[zenoh.Sample]) -> zenoh.Sample | None:
+def _try_recv(handler: _Handler) -> zenoh.Sample | None:
     try:
         return handler.try_recv()
     except zenoh.ZError:  # the subscription is closed, and its queue is empty
@@ -625,7 +625,7 @@ class MeterClient:
         self._prefix = prefix
         self._stack = ExitStack()
         self._live: zenoh.Session | None = None
-        self._estimates: zenoh.handlers.Handler[zenoh.Sample] | None = None
+        self._estimates: _Handler | None = None
         self._publishers: dict[str, zenoh.Publisher] = {}
 
     def __enter__(self) -> MeterClient:

@@ -63,8 +63,8 @@ export class Incidents {
     this.onPick = onPick;
     this.found = [];
     this.items = new Map();
-    this.open = new Map(); // Alarms and events of expanded incidents, with the incident that they belong to.
-    this.requests = new Map(); // Number of the latest request for them.
+    this.open = new Map(); // Alarms and events of expanded incidents.
+    this.requests = new Map(); // Latest request for them that has not failed, with the incident of that time.
     this.chosen = new Set(); // Selected incidents.
     this.feeder = null;
     this.limit = PAGE;
@@ -132,20 +132,24 @@ export class Incidents {
 
   async list(found) {
     this.found = found;
-    await Promise.all(found.filter((one) => this.open.has(one.id) && this.open.get(one.id)?.of !== JSON.stringify(one)).map((one) => this.details(one.id)));
+    await Promise.all(found.filter((one) => this.open.has(one.id) && this.requests.get(one.id)?.of !== JSON.stringify(one)).map((one) => this.details(one.id)));
     this.render();
   }
 
   async details(id) {
-    const number = (this.requests.get(id) ?? 0) + 1;
-    this.requests.set(id, number);
-    const of = JSON.stringify(this.found.find((one) => one.id === id));
-    const [{ alarms, next }, { events }] = await Promise.all([
-      getJson(`${API}/alarms?${new URLSearchParams({ incident: id, limit: ALARMS_SHOWN, sort: "severity" })}`),
-      getJson(`${API}/incidents/${id}/events?limit=1000`),
-    ]);
-    // The response to an earlier request may come after that to a later one.
-    if (this.open.has(id) && this.requests.get(id) === number) this.open.set(id, { of, alarms, more: next !== null, events });
+    const request = { of: JSON.stringify(this.found.find((one) => one.id === id)) };
+    this.requests.set(id, request);
+    try {
+      const [{ alarms, next }, { events }] = await Promise.all([
+        getJson(`${API}/alarms?${new URLSearchParams({ incident: id, limit: ALARMS_SHOWN, sort: "severity" })}`),
+        getJson(`${API}/incidents/${id}/events?limit=1000`),
+      ]);
+      // The response to an earlier request may come after that to a later one.
+      if (this.open.has(id) && this.requests.get(id) === request) this.open.set(id, { alarms, more: next !== null, events });
+    } catch (error) {
+      if (this.requests.get(id) === request) this.requests.delete(id);
+      throw error;
+    }
   }
 
   // Select incidents: ids of others are dropped.

@@ -76,6 +76,16 @@ class Watch:
         """Those of some feeders that had a late tick, or none."""
         return [name for name in names if self.ages_s.get(name, float("inf")) > LATE_S]
 
+    def changed(self, names: Sequence[str]) -> list[str]:
+        """Those of some feeders that were not CLEAN all the time."""
+        return [name for name in names if self.verdicts.get(name) != {"clean"}]
+
+
+def decided(live: ServedCluster) -> None:
+    """Wait until every feeder is displayed as clean."""
+    until(lambda: live.http.get("/readyz").status_code == 200, "readiness")
+    until(lambda: {one["status"] for one in live.listed().values()} == {"clean"}, "verdicts")
+
 
 @contextmanager
 def watched(live: ServedCluster) -> Iterator[Watch]:

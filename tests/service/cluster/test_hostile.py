@@ -25,12 +25,6 @@ def site() -> Site:
     return load("cigre-lv")
 
 
-def decided(live: ServedCluster) -> None:
-    """Wait until every feeder is displayed as clean."""
-    until(lambda: live.http.get("/readyz").status_code == 200, "readiness")
-    until(lambda: {one["status"] for one in live.listed().values()} == {"clean"}, "verdicts")
-
-
 @pytest.fixture(scope="module", params=hostile.KINDS)
 def live(
     request: pytest.FixtureRequest, cluster: Cluster, tmp_path_factory: pytest.TempPathFactory, site: Site
@@ -38,7 +32,7 @@ def live(
     """Four feeders of a single service, or of a front with two workers."""
     folder, options = tmp_path_factory.mktemp("hostile"), hostile.KINDS[request.param]
     with served_cluster(folder, cluster.database(), site, 4, 0, options=options) as made:
-        decided(made)
+        hostile.decided(made)
         yield made
 
 
@@ -47,7 +41,7 @@ def apart(cluster: Cluster, tmp_path: Path, site: Site) -> Iterator[ServedCluste
     """Four feeders of a front and two workers, each with a clock of its own."""
     with served_cluster(tmp_path, cluster.database(), site, 4, 2) as made:
         until(lambda: set(made.owners().values()) == {"w0", "w1"}, "the distribution")
-        decided(made)
+        hostile.decided(made)
         yield made
 
 
@@ -67,7 +61,7 @@ def endured(live: ServedCluster, name: str, seconds: float) -> None:
     assert cost.memory_mb < MEMORY_MB
     assert cost.lines <= LOG_LINES
     live.judged_within(live.names, time.time(), hostile.RECOVERY_S)
-    decided(live)
+    hostile.decided(live)
 
 
 @pytest.mark.canary("single")
