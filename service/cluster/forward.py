@@ -30,13 +30,11 @@ from service.alarms.state_machine import AlarmUnknown
 from service.cluster.messages import (
     FORWARDED,
     Answer,
-    Ask,
     Call,
+    Caller,
     Entry,
-    Envelope,
     Refusals,
     WorkerState,
-    call,
     rest_key,
     state_key,
 )
@@ -132,11 +130,10 @@ class StateCalls:
     workers: takes the states.
     """
 
-    def __init__(self, workers: Workers, ask: Ask, envelope: Envelope) -> None:
-        self._workers, self._ask, self._envelope = workers, ask, envelope
+    def __init__(self, workers: Workers, caller: Caller) -> None:
+        self._workers, self._caller = workers, caller
         self._threads = CapacityLimiter(math.inf)
         self._tasks: dict[str, asyncio.Task[None]] = {}
-        self._replies = Refusals("replies of workers are refused")
         self._refusals = Refusals("states of workers cannot be read")
 
     def follow(self, names: Collection[str]) -> None:
@@ -160,7 +157,7 @@ class StateCalls:
 
     def ask_blocking(self, worker: str) -> bool:
         """Take the next state of a worker; False without one. Blocks. Raises KeyError for another version."""
-        found = call(self._ask, self._envelope, state_key(worker), {}, STATE_S, refusals=self._replies)
+        found = self._caller.call(state_key(worker), {}, STATE_S)
         if found is None:
             return False
         self._workers.take(WorkerState.of(found))
@@ -199,18 +196,16 @@ class Forwarder:
         self,
         workers: Workers,
         store: Reader,
-        ask: Ask,
-        envelope: Envelope,
+        caller: Caller,
         *,
         names: Callable[[], Mapping[str, Any]],
         refresh: Callable[[], Awaitable[None]],
         given: frozenset[str] = frozenset(),
         max_feeders: int = 100,
     ) -> None:
-        self._workers, self._store, self._ask, self._envelope = workers, store, ask, envelope
+        self._workers, self._store, self._caller = workers, store, caller
         self._refresh = refresh
         self._given, self._names, self._max_feeders = given, names, max_feeders
-        self._replies = Refusals("replies of workers are refused")
         # The slots of each worker limit the threads.
         self._threads = CapacityLimiter(math.inf)
         self._slots: WeakValueDictionary[str, asyncio.Semaphore] = WeakValueDictionary()
@@ -305,8 +300,7 @@ class Forwarder:
 
     def ask_blocking(self, worker: str, request: Call, limit_s: float) -> Answer | None:
         """Answer of a worker; None without one. Blocks."""
-        key = rest_key(worker)
-        found = call(self._ask, self._envelope, key, request.content(), limit_s, refusals=self._replies)
+        found = self._caller.call(rest_key(worker), request.content(), limit_s)
         return None if found is None else Answer.of(found)
 
     # ------------------------------------------------------------------------------- the feeder of a request

@@ -122,25 +122,28 @@ class Refusals:
         _log.warning(self._event, messages=count, latest=str(problem))
 
 
-def call(
-    ask: Ask, envelope: Envelope, key: str, content: Content, limit_s: float, *, refusals: Refusals
-) -> Content | None:
-    """Content of the first valid answer to a call; None without one within the time limit. Blocks.
+class Caller:
+    """Calls of workers. Thread-safe."""
 
-    refusals: count of the other replies.
-    """
-    number = secrets.token_hex(8)
-    try:
-        for reply in ask(key, envelope.seal(f"call {key}", {**content, "id": number}), limit_s):
-            try:
-                found = envelope.open(f"answer {key}", reply)
-                if found["to"] == number:
-                    return found
-            except (MessageRefused, ValueError, KeyError, TypeError) as error:
-                refusals.note(error)
-    except BusUnavailable:
+    def __init__(self, ask: Ask, envelope: Envelope) -> None:
+        self._ask, self._envelope = ask, envelope
+        self._refusals = Refusals("replies of workers are refused")
+
+    def call(self, key: str, content: Content, limit_s: float) -> Content | None:
+        """Content of the first valid answer; None without one within the time limit. Blocks."""
+        number = secrets.token_hex(8)
+        message = self._envelope.seal(f"call {key}", {**content, "id": number})
+        try:
+            for reply in self._ask(key, message, limit_s):
+                try:
+                    found = self._envelope.open(f"answer {key}", reply)
+                    if found["to"] == number:
+                        return found
+                except (MessageRefused, ValueError, KeyError, TypeError) as error:
+                    self._refusals.note(error)
+        except BusUnavailable:
+            return None
         return None
-    return None
 
 
 class CallServer:

@@ -25,7 +25,7 @@ from service.app import HttpSide, Running, bus_of, load_sites, read_notify
 from service.cluster.catalogue import Catalogue
 from service.cluster.forward import Forwarder, StateCalls, Workers
 from service.cluster.front import Front, ObservedStore
-from service.cluster.messages import Envelope
+from service.cluster.messages import Caller, Envelope
 from service.ingest.align import Clock
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import fixed_listeners
@@ -222,17 +222,17 @@ async def serve_front(
             settings, shares, lambda _: None, missed=partial(missed, store), wall=wall, everything=False
         )
         stack.enter_context(bus)
+        caller = Caller(bus.ask, envelope)
         forwarder = Forwarder(
             workers,
             store,
-            bus.ask,
-            envelope,
+            caller,
             names=front.names,
             refresh=front.refresh,
             given=frozenset(sites),
             max_feeders=settings.max_feeders,
         )
-        front.attach(forwarder, StateCalls(workers, bus.ask, envelope))
+        front.attach(forwarder, StateCalls(workers, caller))
         async with _supervised(settings):
             await http.serve(
                 stack,

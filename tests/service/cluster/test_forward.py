@@ -18,7 +18,7 @@ from service.access.identity import Identity, Role
 from service.alarms.state_machine import AlarmUnknown
 from service.cluster import forward as module
 from service.cluster.forward import Forwarder, Workers, get
-from service.cluster.messages import Envelope, rest_key
+from service.cluster.messages import Caller, Envelope, rest_key
 from service.errors import NoOwner, WorkerBusy
 from service.store import Store
 from service.store.store import Reader
@@ -45,7 +45,7 @@ async def nothing() -> None:
 def forwarder(store: Reader) -> Forwarder:
     """A forwarder without workers."""
     envelope = Envelope(b"secret")
-    return Forwarder(Workers(), store, lambda *_: [], envelope, names=dict, refresh=nothing)
+    return Forwarder(Workers(), store, Caller(lambda *_: [], envelope), names=dict, refresh=nothing)
 
 
 def forwarded(
@@ -102,7 +102,7 @@ def test_a_busy_worker_does_not_block_the_others(monkeypatch: pytest.MonkeyPatch
         return []
 
     envelope = Envelope(b"secret")
-    made = Forwarder(Workers(), object.__new__(Reader), ask, envelope, names=dict, refresh=nothing)
+    made = Forwarder(Workers(), object.__new__(Reader), Caller(ask, envelope), names=dict, refresh=nothing)
 
     async def run() -> None:
         slow = asyncio.create_task(made.ask_worker("slow", get("/healthz")))

@@ -14,7 +14,7 @@ from service.cluster import front as module
 from service.cluster.catalogue import Catalogue
 from service.cluster.forward import DESIGN_S, StateCalls, Workers
 from service.cluster.front import Front, ObservedStore
-from service.cluster.messages import Answer, Call, Envelope
+from service.cluster.messages import Answer, Call, Caller, Envelope
 from service.errors import NoOwner
 
 
@@ -56,7 +56,7 @@ def test_a_refused_feeder_does_not_block_the_next_one(
             shelve_most_s=3600.0,
             wall=time.time,
         )
-        states = StateCalls(Workers(), lambda *_: [], Envelope(b"secret"))
+        states = StateCalls(Workers(), Caller(lambda *_: [], Envelope(b"secret")))
         front.attach(owners, states)  # type: ignore[arg-type]
 
         async def run() -> None:

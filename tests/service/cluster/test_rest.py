@@ -14,7 +14,16 @@ from starlette.requests import Request
 from service.access.identity import OPEN, Identity, Role
 from service.api.routes import create_api
 from service.cluster.forward import Forwarder, Workers, get
-from service.cluster.messages import Call, CallServer, Entry, Envelope, RestCalls, WorkerState, rest_key
+from service.cluster.messages import (
+    Call,
+    Caller,
+    CallServer,
+    Entry,
+    Envelope,
+    RestCalls,
+    WorkerState,
+    rest_key,
+)
 from service.errors import NoOwner
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import Bus
@@ -53,8 +62,7 @@ class Pair:
         self.forwarder = Forwarder(
             self.workers,
             service.store,
-            front.ask,
-            envelope,
+            Caller(front.ask, envelope),
             names=lambda: dict.fromkeys(self.names),
             refresh=self.refresh,
         )
@@ -164,7 +172,7 @@ def test_a_request_does_not_outlast_its_owner(pair: Pair) -> None:
     unanswered: list[Callable[[bytes], None]] = []
     pair.worker.serve(rest_key("deaf"), lambda _, respond: unanswered.append(respond))
     forwarder = Forwarder(
-        workers, pair.service.store, pair.front.ask, pair.envelope, names=dict, refresh=pair.refresh
+        workers, pair.service.store, Caller(pair.front.ask, pair.envelope), names=dict, refresh=pair.refresh
     )
 
     async def ask(method: str) -> None:

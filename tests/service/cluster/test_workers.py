@@ -19,13 +19,12 @@ from service.cluster.messages import (
     GATHER_S,
     LONGEST_S,
     SHARE,
+    Caller,
     CallServer,
     Entry,
     Envelope,
-    Refusals,
     StateReports,
     WorkerState,
-    call,
     state_key,
 )
 from service.ingest.queues import BusUnavailable
@@ -155,7 +154,7 @@ def line() -> Iterator[Line]:
 
 def test_false_replies_hide_no_state(line: Line) -> None:
     workers, envelope, answer = Workers(), line.envelope(), f"answer {line.key}"
-    calls = StateCalls(workers, line.ask, envelope)
+    calls = StateCalls(workers, Caller(line.ask, envelope))
     assert calls.ask_blocking("w0")
     # An answer to an earlier call is none to this one.
     line.false = [
@@ -168,13 +167,13 @@ def test_false_replies_hide_no_state(line: Line) -> None:
         assert calls.ask_blocking("w0")
     assert [entry["log_level"] for entry in lines] == ["warning"]
     assert workers.states()[0].order == (1, 2)
-    assert call(line.ask, line.envelope(b"guess"), line.key, {}, 0.2, refusals=Refusals("")) is None
+    assert Caller(line.ask, line.envelope(b"guess")).call(line.key, {}, 0.2) is None
 
 
 @pytest.mark.parametrize("leap_s", [3600.0, -3600.0, -10.0])
 def test_a_leap_of_the_clock_of_the_database_silences_no_worker(line: Line, leap_s: float) -> None:
     workers = Workers()
-    calls = StateCalls(workers, line.ask, line.envelope())
+    calls = StateCalls(workers, Caller(line.ask, line.envelope()))
     assert calls.ask_blocking("w0")
     line.now += leap_s
     assert calls.ask_blocking("w0")
@@ -185,7 +184,7 @@ def test_a_blocked_reply_does_not_hold_up_the_event_loop(line: Line) -> None:
     goes_on = threading.Event()
     line.server(line.envelope().seal(f"call {line.key}", {}), lambda _: bool(goes_on.wait(20.0)))
     workers = Workers()
-    assert StateCalls(workers, line.ask, line.envelope()).ask_blocking("w0")
+    assert StateCalls(workers, Caller(line.ask, line.envelope())).ask_blocking("w0")
     goes_on.set()
 
 
@@ -208,7 +207,7 @@ def test_the_live_workers_are_asked_and_no_others(monkeypatch: pytest.MonkeyPatc
         return set(asked)
 
     async def run() -> None:
-        calls = StateCalls(Workers(), ask, Envelope(b"secret"))
+        calls = StateCalls(Workers(), Caller(ask, Envelope(b"secret")))
         assert await keys(calls, "w0", "w1") == {state_key("w0"), state_key("w1")}
         assert await keys(calls, "w0") == {state_key("w0")}
         assert await keys(calls) == set()
@@ -223,7 +222,7 @@ def test_a_flood_of_forged_calls_has_one_line_of_the_log(line: Line) -> None:
             line.server(b"0" * 200, replies.append)
     assert replies == [b""] * 1000
     assert [(entry["messages"], entry["log_level"]) for entry in lines] == [(1, "warning")]
-    assert StateCalls(Workers(), line.ask, line.envelope()).ask_blocking("w0")
+    assert StateCalls(Workers(), Caller(line.ask, line.envelope())).ask_blocking("w0")
 
 
 @pytest.mark.parametrize(
