@@ -301,21 +301,25 @@ class Bus:
                 first = handler.recv()
             except zenoh.ZError:  # the subscription is closed and drained
                 return
-            self._deliver(list(self._copies(_waiting(handler, first), None)))
+            self._deliver(list(self._copies(_waiting(handler, BATCH, first), None)))
 
     def _poll(self, closing: threading.Event) -> None:
-        """Deliver the samples of all subscriptions, `BATCH` of each in turn, until `closing` is set."""
+        """Deliver the samples of all subscriptions, `BATCH` of each in turn, until `closing` is set.
+
+        Samples on patterns of keys are not counted: a flood of them would leave a feeder's own ones in its
+        queue until they are displaced.
+        """
         while not closing.wait(POLL_S):
             batch: list[Sample] = []
             for feeder, (_, handler) in list(self._followed.items()):
                 # Most of them are empty: the look is the cost.
                 if (first := _try_recv(handler)) is not None:
-                    batch += self._copies(_waiting(handler, first), feeder)
+                    batch += islice(self._copies(_waiting(handler, RING, first), feeder), BATCH)
                 if len(batch) >= BATCH:
                     self._deliver(batch)
                     batch = []
             if self._others is not None:
-                batch += self._copies(_waiting(self._others[1]), None)
+                batch += self._copies(_waiting(self._others[1], BATCH), None)
             if batch:
                 self._deliver(batch)
 
@@ -593,9 +597,9 @@ def _refuse(query: zenoh.Query, problem: str) -> None:
         query.reply_err(json.dumps({"detail": problem}), encoding=JSON)
 
 
-def _waiting(handler: _Handler, *first: zenoh.Sample) -> Iterator[zenoh.Sample]:
-    """Some samples and those that wait in a queue behind them, up to `BATCH` together."""
-    return islice(chain(first, iter(partial(_try_recv, handler), None)), BATCH)
+def _waiting(handler: _Handler, most: int, *first: zenoh.Sample) -> Iterator[zenoh.Sample]:
+    """Some samples and those that wait in a queue behind them, up to `most` together."""
+    return islice(chain(first, iter(partial(_try_recv, handler), None)), most)
 
 
 def _try_recv(handler: _Handler) -> zenoh.Sample | None:
