@@ -32,7 +32,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
@@ -58,7 +58,7 @@ from service.ingest.align import Aligner, rules
 from service.ingest.decode import Wire
 from service.ingest.queues import BusConfig, BusCounts, Sample, Value
 from service.ingest.reading import Known
-from service.ingest.zenoh_bus import Bus, MeterClient, session
+from service.ingest.zenoh_bus import DECLARED, Bus, MeterClient, session
 from service.report.tick_state import TickState
 from service.store import Store
 from service.store.committer import Committer
@@ -402,7 +402,7 @@ class Fleet(threading.Thread):
     """Publishes every meter of all feeders once in `tick_s`; feeders follow each other within a part of it.
 
     All feeders have the readings of one simulation, which never repeats: a repeated error of a meter is a
-    systematic one, and would be found.
+    systematic one, and would be found. A session declares all its keys; real meters have one each.
     """
 
     def __init__(
@@ -411,12 +411,15 @@ class Fleet(threading.Thread):
         super().__init__(daemon=True)
         self.seconds = simulate(site, Scenario(seed=1, duration_s=math.inf, dt_s=tick_s))
         self.names, self.form, self.endpoint, self.tick_s = names, form, endpoint, tick_s
+        # Of a feeder: its meters, or one concentrator, and the busbar.
+        self.keys = 1 + (len(site.meter_ids) if form == "json" else 1)
         self.behind_s, self.sent = 0.0, 0
         self.ended = threading.Event()
 
     def run(self) -> None:
         """Publish."""
-        with MeterClient(BusConfig("client", connect=(self.endpoint,)), "gridsec") as meters:
+        with ExitStack() as stack:
+            meters = self._sessions(stack)
             begun = math.floor(time.time() / self.tick_s) + 1
             for number, second in enumerate(self.seconds, begun):
                 t = number * self.tick_s
@@ -426,9 +429,18 @@ class Fleet(threading.Thread):
                     if self.ended.wait(max(0.0, t + APART * self.tick_s * k / len(self.names) - time.time())):
                         return
                     for key, payload, kind in sent:
-                        meters.put(name + key, payload, kind)
+                        meters[name].put(name + key, payload, kind)
                         self.sent += len("gridsec/") + len(name) + len(key) + len(payload)
                 self.behind_s = max(self.behind_s, time.time() - t - self.tick_s)
+
+    def _sessions(self, stack: ExitStack) -> dict[str, MeterClient]:
+        """Open the sessions; the one of each feeder."""
+        together = max(1, DECLARED // self.keys)
+        found: dict[str, MeterClient] = {}
+        for start in range(0, len(self.names), together):
+            one = MeterClient(BusConfig("client", connect=(self.endpoint,)), "gridsec")
+            found |= dict.fromkeys(self.names[start : start + together], stack.enter_context(one))
+        return found
 
 
 OWN = Path(__file__).parents[1]
