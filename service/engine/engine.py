@@ -513,10 +513,9 @@ class Engine:
         self._clear_orphans()
         bad = self._place(samples)
         self._keep_order(at_once=False)
-        self._reach(self._wall(), oldest())
         placed = time.thread_time()
+        self._reach(self._wall(), oldest())
         results = self._judge()
-        judged = time.thread_time()
         entries, left_out = some_of_each(bad)
         self.committer.waiting.add(rejected=entries)
         self.metrics.forgotten.labels("bad-reading").inc(left_out)
@@ -535,7 +534,7 @@ class Engine:
         if samples or results:
             self.metrics.cycle.observe(lasted)
         spent = time.thread_time() - begun
-        self.load.count_round(lasted, spent, placed - begun, judged - placed, len(samples))
+        self.load.count_round(lasted, spent, placed - begun, len(samples))
         return bool(results)
 
     def control(self, inbox: Inbox, dropped: int) -> None:
@@ -544,10 +543,15 @@ class Engine:
         `dropped` is the number of samples that the queue has dropped since the last call.
         """
         self.load.count_losses(dropped)
+        if not self.load.due:
+            return
         for name, load in self.load.feeders.items():
             load.standing = bool(self.metrics.active(name))
-        if not self.load.update(inbox.offered()):
-            return
+        if self.load.update(inbox.offered()):
+            self.follow_load(inbox)
+
+    def follow_load(self, inbox: Inbox) -> None:
+        """Begin and end the monitoring of feeders as `load.shed` states."""
         shed = frozenset(self.load.shed)
         changed = sorted(shed ^ inbox.shed)
         inbox.shed = shed
@@ -570,16 +574,18 @@ class Engine:
         back, before, self._until = now < self._until, self._until, now
         for name, monitor in self.monitors.items():
             until = min(now, waiting.get(name, now))
-            if back:
-                # The alignment detects a clock that is set back by the latest time that it has reached.
-                self._guarded(monitor, partial(monitor.reach, before))
             if back or self._wakes[name] <= until:
+                started = time.thread_time()
+                if back:
+                    # The alignment detects a clock that is set back by the latest time that it has reached.
+                    self._guarded(monitor, partial(monitor.reach, before))
                 self._guarded(monitor, partial(monitor.reach, until))
                 self._set_wake(monitor)
+                self.load.count_forming(name, time.thread_time() - started)
 
     def _set_wake(self, monitor: FeederMonitor) -> None:
         """Note the latest time of a monitor's next tick; at `Clock.EVENTS` only readings cause one."""
-        wake = monitor.aligner.wake()
+        wake = monitor.wake
         self._wakes[monitor.name] = math.inf if wake is None else wake
 
     @property

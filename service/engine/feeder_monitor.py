@@ -204,6 +204,8 @@ OVERLOAD_REASON = "not monitored: the service is overloaded, and discards the re
 
 PATIENCE_MIN_S = 5.0
 """Lower limit of `patience_s`, s."""
+SHED_PATIENCE = 0.6
+"""Interval of the ticks of a shed feeder, parts of `patience_s`: its state is never stale."""
 
 
 class Phase(StrEnum):
@@ -393,8 +395,19 @@ class FeederMonitor:
         self.pending.extend(placed.ticks)
         return placed
 
+    @property
+    def wake(self) -> float | None:
+        """Latest wall time of the next tick, Unix s; None if only readings can cause one."""
+        wake = self.aligner.wake()
+        if wake is None or not self.shed or self.latest is None or self.latest.cause is not Cause.OVERLOAD:
+            return wake
+        tick_s = self.aligner.rules.tick_s
+        return wake + tick_s * max(0, int(SHED_PATIENCE * self.patience_s / tick_s) - 1)
+
     def reach(self, now: float) -> None:
-        """Add the ticks that are due without a new reading to the pending ones."""
+        """Add the ticks that are due without a new reading to the pending ones; while shed the newest."""
+        if self.shed:
+            self.aligner.pass_over(now)
         self.pending.extend(self.aligner.due(now))
 
     def skip(self, count: int) -> None:

@@ -3,10 +3,11 @@
 The demand of a feeder is ``factor (c_s n + c_t / tick_s) / capacity``: seconds of a round for each second.
 n: samples offered per second. c_s: processor time of a sample. c_t: processor time of a tick. factor: that of
 everything else in a round. capacity: part of the time in which no round waits for the processor, which other
-threads and processes have. Samples of a feeder that is not monitored are counted: its demand stays known.
+threads and processes have. Samples of a feeder that is not monitored are counted: its demand stays known. The
+time of its ticks is no part of c_s, c_t and factor: that of hundreds would make the others look expensive.
 
-Under lasting overload whole feeders are shed until the demand of the others is `KEPT`. They return as
-soon as the demand of all fits again.
+Under lasting overload whole feeders are shed until the demand of the others and of the ticks of the shed ones
+is `KEPT`. They return as soon as the demand of all fits again.
 """
 
 from __future__ import annotations
@@ -62,7 +63,8 @@ class Window:
     lasted_s: float = 0.0  # duration of all rounds, s
     rounds_s: float = 0.0  # processor time of all rounds, s
     placed_s: float = 0.0  # that of decoding and alignment, s
-    judged_s: float = 0.0  # that of ticks, s
+    judged_s: float = 0.0  # that of ticks of monitored feeders, s
+    shed_s: float = 0.0  # that of ticks of the others, s
     samples: int = 0  # processed samples
     signs: int = 0  # lost samples, skipped ticks and long rounds
 
@@ -83,29 +85,36 @@ class LoadControl:
     _sample_cost_s: float = 0.0
     _factor: float = 1.0
     _capacity: float = 1.0
+    _shed_cost: float = 0.0  # processor time of the ticks of shed feeders, s for each second
     _overloaded: int = 0
     _hold_s: float = HOLD_S
     _last: float | None = None
 
-    def count_round(
-        self, lasted_s: float, rounds_s: float, placed_s: float, judged_s: float, samples: int
-    ) -> None:
+    def count_round(self, lasted_s: float, rounds_s: float, placed_s: float, samples: int) -> None:
         """Add the times of a round as in `Window`, s, and the number of its samples."""
         window = self._now()
         window.lasted_s += lasted_s
         window.rounds_s += rounds_s
         window.placed_s += placed_s
-        window.judged_s += judged_s
         window.samples += samples
         window.signs += lasted_s > LONG_ROUND_S
 
     def count_tick(self, feeder: str, spent_s: float) -> None:
         """Add the processor time of a tick, s; the first one of a feeder does not count."""
         load = self.feeders[feeder]
+        self.count_forming(feeder, spent_s)
+        load.ticks += load.begun
+        load.begun = feeder not in self.shed
+
+    def count_forming(self, feeder: str, spent_s: float) -> None:
+        """Add the processor time of a part of a tick, s."""
+        load, window = self.feeders[feeder], self._now()
+        if feeder in self.shed:
+            window.shed_s += spent_s
+        else:
+            window.judged_s += spent_s
         if load.begun:
             load.spent_s += spent_s
-            load.ticks += 1
-        load.begun = feeder not in self.shed
 
     def count_losses(self, number: int) -> None:
         """Add samples or ticks that are lost by overload."""
@@ -123,11 +132,12 @@ class LoadControl:
         return self._factor * cost / self._capacity
 
     def _kept(self) -> float:
-        """Demand of the monitored feeders."""
-        return sum(self.demand(name) for name in self.feeders if name not in self.shed)
+        """Demand of the monitored feeders, and of the ticks of the others."""
+        own = sum(self.demand(name) for name in self.feeders if name not in self.shed)
+        return own + self._shed_cost / self._capacity
 
     def figures(self) -> dict[str, float]:
-        """Return the demand of the monitored feeders and of all, and the measured parts of the model."""
+        """Return the present demand, that with all feeders monitored, and the measured parts of the model."""
         figures = {
             "demand": self._kept(),
             "demand_of_all": sum(self.demand(name) for name in self.feeders),
@@ -136,15 +146,20 @@ class LoadControl:
         }
         return {name: round(value, 2) for name, value in figures.items()}
 
+    @property
+    def due(self) -> bool:
+        """True at the end of a window."""
+        return self.clock() - self._now().begun >= WINDOW_S
+
     def update(self, offered: Mapping[str, int]) -> bool:
         """Decide at the end of a window; return True if `shed` has changed.
 
         `offered` is the number of samples of each feeder so far.
         """
+        if not self.due:
+            return False
         window, now = self._now(), self.clock()
         elapsed = now - window.begun
-        if elapsed < WINDOW_S:
-            return False
         self._measure(window, elapsed, offered)
         self._window = Window(now)
         before = set(self.shed)
@@ -174,7 +189,9 @@ class LoadControl:
         self._capacity += _SMOOTH * (max(CAPACITY_MIN, 1.0 - waited) - self._capacity)
         spent = window.placed_s + window.judged_s
         if spent > 0.0:
-            self._factor = min(2.0, max(1.0, window.rounds_s / spent))
+            self._factor = min(2.0, max(1.0, (window.rounds_s - window.shed_s) / spent))
+        cost = window.shed_s / elapsed
+        self._shed_cost = self._shed_cost + _SMOOTH * (cost - self._shed_cost) if self.shed else 0.0
         for name, load in self.feeders.items():
             number = offered.get(name, load.offered)
             load.rate, load.offered = max(0, number - load.offered) / elapsed, number
@@ -215,9 +232,10 @@ class LoadControl:
             self.shed[name] = now
 
     def _take_back(self, kept: float) -> None:
-        """Monitor feeders again while their demand fits."""
+        """Monitor feeders again while their demand fits, in place of their rare ticks."""
+        each = self._shed_cost / self._capacity / len(self.shed)
         for name in list(self.shed):
-            kept += self.demand(name)
+            kept += self.demand(name) - each
             if kept > KEPT:
                 return
             del self.shed[name]

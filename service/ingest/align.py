@@ -659,6 +659,13 @@ class Aligner:
             self._resumed = self._time(self._next)
             self._turn_to(self._next)
 
+    def pass_over(self, wall: float) -> None:
+        """Do not form the ticks before the newest one that is due at the wall time, Unix s."""
+        if self._next is not None:
+            newest = math.floor((wall - self.rules.grace_s) / self.rules.tick_s)
+            if newest > self._next:
+                self._turn_to(newest)
+
     def flush(self) -> Iterator[Tick]:
         """Emit every tick that the time has reached, without grace: the input has ended."""
         if self._now is None and self._claims:

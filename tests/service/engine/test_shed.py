@@ -17,7 +17,6 @@ from service.engine.feeder_monitor import MISMATCH_S, design
 from service.ingest.align import Clock
 from service.ingest.queues import Inbox, Sample
 from service.store import Store
-from tests.service.engine.test_load import shed_by
 from tests.service.liars import FEEDER, START
 
 OTHER = "other"
@@ -48,7 +47,7 @@ class Pair:
     def shed(self, *names: str) -> None:
         """Shed these feeders, and monitor all others."""
         self.live.load.shed = dict.fromkeys(names, 0.0)
-        shed_by(self.live, self.box)
+        self.live.follow_load(self.box)
 
     def run(
         self, seconds: int, *, silent: Collection[str] = (), late: str = "", refused: Collection[str] = ()
@@ -92,6 +91,29 @@ def pair(site: Site, tmp_path: Path) -> Iterator[Pair]:
         yield Pair(site, store)
 
 
+def test_ticks_of_a_shed_feeder_are_rare_and_never_stale(pair: Pair) -> None:
+    monitor, ticks = pair.live.monitors[OTHER], list[float]()
+    pair.run(3)
+    pair.shed(OTHER)
+    for k in range(30):
+        pair.run(1)
+        report = monitor.report
+        assert report is not None
+        assert report.cause is Cause.OVERLOAD, k  # from the next tick on
+        assert pair.wall - report.t < monitor.patience_s - 1.0
+        ticks.append(report.t)
+    assert len(set(ticks)) <= 11
+    # It counts no tick as skipped: that is a sign of overload.
+    assert monitor.skipped == 0
+    pair.shed()
+    for _ in range(5):
+        pair.run(1)
+        assert monitor.latest is not None
+        assert monitor.latest.t > pair.wall - 2.0
+    assert monitor.latest is not None
+    assert monitor.latest.cause is not Cause.OVERLOAD
+
+
 def test_a_shed_feeder_can_be_removed(pair: Pair) -> None:
     pair.run(2)
     pair.shed(OTHER)
@@ -112,7 +134,7 @@ def test_a_shed_feeder_that_is_put_again_stays_shed(pair: Pair) -> None:
     pair.live.add(pair.other).install(design(pair.other))
     # The count of its samples goes on: the next window sees no flood.
     assert pair.live.load.feeders[OTHER].offered == offered > 0
-    pair.run(16)
+    pair.run(20)
     assert (pair.cause(), pair.standing()) == (Cause.OVERLOAD, {(AlarmKind.UNDECIDED, None)})
     pair.shed()
     pair.run(9)
