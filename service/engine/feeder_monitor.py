@@ -204,8 +204,8 @@ OVERLOAD_REASON = "not monitored: the service is overloaded, and discards the re
 
 PATIENCE_MIN_S = 5.0
 """Lower limit of `patience_s`, s."""
-SHED_PATIENCE = 0.6
-"""Interval of the ticks of a shed feeder, parts of `patience_s`: its state is never stale."""
+SHED_TICK_S = 15.0
+"""Interval of the ticks of a shed feeder, s; a tick takes about as long as one with readings."""
 
 
 class Phase(StrEnum):
@@ -402,7 +402,7 @@ class FeederMonitor:
         if wake is None or not self.shed or self.latest is None or self.latest.cause is not Cause.OVERLOAD:
             return wake
         tick_s = self.aligner.rules.tick_s
-        return wake + tick_s * max(0, int(SHED_PATIENCE * self.patience_s / tick_s) - 1)
+        return wake + tick_s * max(0, int(SHED_TICK_S / tick_s) - 1)
 
     def reach(self, now: float) -> None:
         """Add the ticks that are due without a new reading to the pending ones; while shed the newest."""

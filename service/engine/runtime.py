@@ -513,7 +513,7 @@ class Runtime:
             elif monitor.phase is Phase.FAILED:
                 problems.append(f"feeder {monitor.name}: {monitor.problem}")
             # With `Clock.EVENTS` the time may stand still.
-            told, waits = monitor.latest, engine.config.clock is Clock.WALL
+            told, waits = monitor.latest, engine.config.clock is Clock.WALL and not monitor.shed
             if waits and told is not None and (age := self.age(told)) > monitor.patience_s:
                 problems.append(f"feeder {monitor.name}: the latest report is {age:.0f} s old")
         if shed := len(self._inbox.shed):

@@ -13,7 +13,7 @@ from feeders.model.site import Site, from_tables
 from gridsec.interface import Cause
 from service.alarms.state_machine import AlarmKind
 from service.engine.engine import Engine, RuntimeConfig
-from service.engine.feeder_monitor import MISMATCH_S, design
+from service.engine.feeder_monitor import MISMATCH_S, SHED_TICK_S, design
 from service.ingest.align import Clock
 from service.ingest.queues import Inbox, Sample
 from service.store import Store
@@ -91,18 +91,18 @@ def pair(site: Site, tmp_path: Path) -> Iterator[Pair]:
         yield Pair(site, store)
 
 
-def test_ticks_of_a_shed_feeder_are_rare_and_never_stale(pair: Pair) -> None:
+def test_ticks_of_a_shed_feeder_are_rare(pair: Pair) -> None:
     monitor, ticks = pair.live.monitors[OTHER], list[float]()
     pair.run(3)
     pair.shed(OTHER)
-    for k in range(30):
+    for _ in range(40):
         pair.run(1)
         report = monitor.report
         assert report is not None
-        assert report.cause is Cause.OVERLOAD, k  # from the next tick on
-        assert pair.wall - report.t < monitor.patience_s - 1.0
+        assert report.cause is Cause.OVERLOAD  # from the next tick on
+        assert pair.wall - report.t < SHED_TICK_S + 2.0
         ticks.append(report.t)
-    assert len(set(ticks)) <= 11
+    assert len(set(ticks)) <= 4
     # It counts no tick as skipped: that is a sign of overload.
     assert monitor.skipped == 0
     pair.shed()
@@ -134,7 +134,8 @@ def test_a_shed_feeder_that_is_put_again_stays_shed(pair: Pair) -> None:
     pair.live.add(pair.other).install(design(pair.other))
     # The count of its samples goes on: the next window sees no flood.
     assert pair.live.load.feeders[OTHER].offered == offered > 0
-    pair.run(20)
+    # Its meters are silent first, as after a start.
+    pair.run(int(2 * SHED_TICK_S) + 6)
     assert (pair.cause(), pair.standing()) == (Cause.OVERLOAD, {(AlarmKind.UNDECIDED, None)})
     pair.shed()
     pair.run(9)
