@@ -31,6 +31,13 @@ CALM_S = 60.0
 """Time without overload after which the first hold applies again, s."""
 FLOOD = 2.0
 """Samples of each meter and tick from which a feeder is shed before all others."""
+RETURNING, RETURNING_MIN = 0.25, 8
+"""Largest number of feeders that return in a window: a part of the monitored ones, and at least a number.
+
+The first ticks after a return take up to ten times as long: their readings are old, or not there yet.
+"""
+WARM_TICKS = 10
+"""Ticks of a feeder after a return that do not count in its cost."""
 CAPACITY_MIN = 0.1
 """Smallest capacity: a process that gets less cannot be helped by fewer feeders."""
 _SMOOTH, _FALL = 0.3, 0.7
@@ -50,7 +57,7 @@ class FeederLoad:
     spent_s: float = 0.0  # processor time of its ticks in this window, s
     ticks: int = 0  # its ticks in this window
     tick_cost_s: float = 0.0  # mean time of a tick, s
-    begun: bool = False  # its first tick since a start or a return, of another cost, is over
+    warm: int = WARM_TICKS - 1  # its ticks since a return, up to `WARM_TICKS`; one less after a start
     offered: int = 0  # number of samples until this window
     rate: float = 0.0  # samples offered per second
 
@@ -100,11 +107,11 @@ class LoadControl:
         window.signs += lasted_s > LONG_ROUND_S
 
     def count_tick(self, feeder: str, spent_s: float) -> None:
-        """Add the processor time of a tick, s; the first one of a feeder does not count."""
+        """Add the processor time of a tick, s; the first ones of a feeder do not count in its cost."""
         load = self.feeders[feeder]
         self.count_forming(feeder, spent_s)
-        load.ticks += load.begun
-        load.begun = feeder not in self.shed
+        load.ticks += load.warm == WARM_TICKS
+        load.warm = 0 if feeder in self.shed else min(WARM_TICKS, load.warm + 1)
 
     def count_forming(self, feeder: str, spent_s: float) -> None:
         """Add the processor time of a part of a tick, s."""
@@ -113,7 +120,7 @@ class LoadControl:
             window.shed_s += spent_s
         else:
             window.judged_s += spent_s
-        if load.begun:
+        if load.warm == WARM_TICKS:
             load.spent_s += spent_s
 
     def count_losses(self, number: int) -> None:
@@ -203,18 +210,21 @@ class LoadControl:
         self._forget_costs()
 
     def _forget_costs(self) -> None:
-        """Let the cost of shed feeders fall to the mean of the monitored ones, by their sources.
+        """Let the cost of shed and of returned feeders fall to the mean of the others, by their sources.
 
-        It is not measured while they are shed: one that was large for a short time would keep them out.
+        It is not measured meanwhile: one that was large for a short time would keep them out.
         """
-        known = [one for name, one in self.feeders.items() if name not in self.shed and one.tick_cost_s > 0.0]
+        cold = [one for name, one in self.feeders.items() if name in self.shed or one.warm < WARM_TICKS]
+        known = [
+            one
+            for name, one in self.feeders.items()
+            if name not in self.shed and one.warm == WARM_TICKS and one.tick_cost_s > 0.0
+        ]
         if not known:
             return
         each = sum(one.tick_cost_s for one in known) / sum(one.sources for one in known)
-        for name in self.shed:
-            load = self.feeders.get(name)
-            if load is not None:
-                load.tick_cost_s += _SMOOTH * min(0.0, each * load.sources - load.tick_cost_s)
+        for load in cold:
+            load.tick_cost_s += _SMOOTH * min(0.0, each * load.sources - load.tick_cost_s)
 
     def _shed_more(self, kept: float, now: float) -> None:
         """Shed feeders: floods first, feeders with active alarms last. At least one stays."""
@@ -234,7 +244,8 @@ class LoadControl:
     def _take_back(self, kept: float) -> None:
         """Monitor feeders again while their demand fits, in place of their rare ticks."""
         each = self._shed_cost / self._capacity / len(self.shed)
-        for name in list(self.shed):
+        most = max(RETURNING_MIN, int(RETURNING * (len(self.feeders) - len(self.shed))))
+        for name in list(self.shed)[:most]:
             kept += self.demand(name) - each
             if kept > KEPT:
                 return

@@ -95,7 +95,7 @@ def test_a_costly_start_of_all_feeders_does_not_keep_them_out() -> None:
     for _ in range(5):
         second(0.12)
     assert 80 <= len(machine.shed) < 100
-    for _ in range(15):
+    for _ in range(20):
         second(0.006)
     assert not machine.shed
     # One costly tick of each feeder, as at the start of the service, sheds none.
