@@ -14,11 +14,13 @@ pseudo-measurements. Loads and generation are random. Three attacks of size 3 %:
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from feeders.model.site import load
+from feeders.convert.convert import convert
+from feeders.model.site import Site, load
 from feeders.simulation.powerflow import Grid, PowerFlow
 from gridsec.arrays import Bools, Floats
 from gridsec.grid.radial import Feeder
@@ -28,6 +30,17 @@ SIZE = 0.03
 
 ATTACKS = ("bias", "coord", "coord+pq")
 FEEDERS = {"rural1": "simbench-lv-rural1", "rural3": "simbench-lv-rural3"}
+HELD_OUT = {
+    "rural2": "simbench:1-LV-rural2--0-sw",
+    "semiurb4": "simbench:1-LV-semiurb4--0-sw",
+    "semiurb5": "simbench:1-LV-semiurb5--0-sw",
+    "urban6": "simbench:1-LV-urban6--0-sw",
+    "landnetz_f2": "pandapower:create_kerber_landnetz_freileitung_2",
+    "landnetz_k1": "pandapower:create_kerber_landnetz_kabel_1",
+    "landnetz_k2": "pandapower:create_kerber_landnetz_kabel_2",
+    "vorstadt_k2": "pandapower:create_kerber_vorstadtnetz_kabel_2",
+}
+"""Sources of networks on which no parameter of any method was chosen; see `feeders.convert`."""
 POWER_FACTOR_TAN = 0.33
 # No power is known better than this part of the feeder's mean connected load.
 FLOOR = 0.5
@@ -40,7 +53,7 @@ class Cell:
     Attributes
     ----------
     feeder
-        Key of `FEEDERS`.
+        Key of `FEEDERS` or `HELD_OUT`.
     std_v, std_pq
         Standard deviation of a voltage reading, and of the powers, as fractions.
     attack, liars
@@ -126,7 +139,19 @@ class Snapshot:
     true_v: Floats
 
 
-TRANSFORMERS = {"rural1": Transformer(160.0, 4.0, 1.46875), "rural3": Transformer(400.0, 6.0, 1.2)}
+TRANSFORMERS = {
+    "rural1": Transformer(160.0, 4.0, 1.46875),
+    "rural2": Transformer(250.0, 6.0, 1.32),
+    "rural3": Transformer(400.0, 6.0, 1.2),
+    "semiurb4": Transformer(400.0, 6.0, 1.2),
+    "semiurb5": Transformer(630.0, 6.0, 1.09524),
+    "urban6": Transformer(630.0, 6.0, 1.09524),
+    "landnetz_f2": Transformer(100.0, 4.0, 1.2),
+    "landnetz_k1": Transformer(100.0, 4.0, 1.2),
+    "landnetz_k2": Transformer(160.0, 4.0, 1.2),
+    "vorstadt_k2": Transformer(630.0, 4.0, 1.0794),
+}
+"""Those of the sources."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,9 +179,9 @@ def mean(told: Snapshot) -> Reading:
 
 
 def scene(feeder: str) -> Scene:
-    """Prepare a feeder of `FEEDERS`; one that ends in `-behind` is fed through its transformer."""
+    """Prepare a feeder by its name; one that ends in `-behind` is fed through its transformer."""
     name, _, behind = feeder.partition("-")
-    site = load(FEEDERS[name])
+    site = load(FEEDERS[name]) if name in FEEDERS else _converted(HELD_OUT[name])
     load_kw, sun_kw = np.array([(c.load_kw, c.pv_kw) for c in site.tables.customers]).T
     kva = site.feeder.base_kva
     flow, tree = PowerFlow(site), site.feeder
@@ -164,6 +189,12 @@ def scene(feeder: str) -> Scene:
         tree, grid = _behind(tree, flow.grid, TRANSFORMERS[name])
         flow = PowerFlow.of(grid)
     return Scene(tree, flow, load_kw / kva, sun_kw / kva)
+
+
+def _converted(source: str) -> Site:
+    with tempfile.TemporaryDirectory() as folder:
+        convert(source, folder, name="converted")
+        return load(folder)
 
 
 def _behind(tree: Feeder, grid: Grid, of: Transformer) -> tuple[Feeder, Grid]:
