@@ -298,7 +298,7 @@ class Engine:
             settings.tick_s, len(site.meter_ids) + 1, offered=old.offered if old else 0
         )
         if name in self.load.shed:
-            monitor.set_shed(True)
+            monitor.set_shed(True, self._wall())
         self.unloaded.pop(name, None)
         self._restore_order(name, past.signed)
         self._learn({**self._wire.known, name: known_of(site)})
@@ -560,7 +560,7 @@ class Engine:
             monitor = self.monitors.get(name)
             if monitor is None:  # a removed feeder
                 continue
-            monitor.set_shed(name in shed)
+            monitor.set_shed(name in shed, self._wall())
             self._set_wake(monitor)
         self.metrics.shed.set(len(shed))
         told = {"feeders": len(shed), "changed": changed[:SHOWN], **self.load.figures()}

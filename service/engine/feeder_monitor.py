@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 
@@ -205,7 +206,7 @@ OVERLOAD_REASON = "not monitored: the service is overloaded, and discards the re
 PATIENCE_MIN_S = 5.0
 """Lower limit of `patience_s`, s."""
 SHED_TICK_S = 15.0
-"""Interval of the ticks of a shed feeder, s; a tick takes about as long as one with readings."""
+"""Interval of the ticks of a feeder that is displayed as shed, s; one takes as long as one with readings."""
 
 
 class Phase(StrEnum):
@@ -396,19 +397,30 @@ class FeederMonitor:
         return placed
 
     @property
+    def _rests(self) -> bool:
+        """True while it is shed, the display states it, and no alarm waits for its delay."""
+        shown = None if self.latest is None else self.latest.displayed
+        if not self.shed or shown is None or shown[0].cause is not Cause.OVERLOAD:
+            return False
+        return any(alarm.kind is AlarmKind.UNDECIDED for alarm in self.book.active)
+
+    @property
     def wake(self) -> float | None:
         """Latest wall time of the next tick, Unix s; None if only readings can cause one."""
-        wake = self.aligner.wake()
-        if wake is None or not self.shed or self.latest is None or self.latest.cause is not Cause.OVERLOAD:
+        wake, tick_s = self.aligner.wake(), self.aligner.rules.tick_s
+        every = int(SHED_TICK_S / tick_s)
+        if wake is None or every < 2 or not self._rests:
             return wake
-        tick_s = self.aligner.rules.tick_s
-        return wake + tick_s * max(0, int(SHED_TICK_S / tick_s) - 1)
+        # Shed feeders have their ticks in different seconds.
+        return wake + tick_s * ((crc32(self.name.encode()) - math.floor(wake / tick_s)) % every)
 
     def reach(self, now: float) -> None:
-        """Add the ticks that are due without a new reading to the pending ones; while shed the newest."""
-        if self.shed:
+        """Add the ticks that are due without a new reading to the pending ones; at rest only the newest."""
+        rests = self._rests
+        if rests:
             self.aligner.pass_over(now)
-        self.pending.extend(self.aligner.due(now))
+        ticks = list(self.aligner.due(now))
+        self.pending.extend(ticks[-1:] if rests else ticks)
 
     def skip(self, count: int) -> None:
         """Drop the oldest pending ticks without evaluation; the next one counts them.
@@ -425,8 +437,10 @@ class FeederMonitor:
         self.skipped += tick.skipped
         return self._result(tick)
 
-    def set_shed(self, shed: bool) -> None:
-        """Begin or end the time without monitoring; it is no evidence of silence."""
+    def set_shed(self, shed: bool, now: float) -> None:
+        """Begin or end the time without monitoring at the wall time, Unix s; it is no evidence of silence."""
+        if self._rests:
+            self.aligner.pass_over(now)
         self.shed = shed
         self.aligner.excuse()
         # Nothing is decoded meanwhile: problems of refused identities last from the return on.

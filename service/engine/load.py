@@ -7,7 +7,7 @@ threads and processes have. Samples of a feeder that is not monitored are counte
 time of its ticks is no part of c_s, c_t and factor: that of hundreds would make the others look expensive.
 
 Under lasting overload whole feeders are shed until the demand of the others and of the ticks of the shed ones
-is `KEPT`. They return as soon as the demand of all fits again.
+is `KEPT`. They return in parts while the demand fits.
 """
 
 from __future__ import annotations
@@ -34,10 +34,8 @@ FLOOD = 2.0
 RETURNING, RETURNING_MIN = 0.25, 8
 """Largest number of feeders that return in a window: a part of the monitored ones, and at least a number.
 
-The first ticks after a return take up to ten times as long: their readings are old, or not there yet.
+The first ticks after a return take longer, and the cost of a tick is that of few feeders.
 """
-WARM_TICKS = 10
-"""Ticks of a feeder after a return that do not count in its cost."""
 CAPACITY_MIN = 0.1
 """Smallest capacity: a process that gets less cannot be helped by fewer feeders."""
 _SMOOTH, _FALL = 0.3, 0.7
@@ -57,7 +55,7 @@ class FeederLoad:
     spent_s: float = 0.0  # processor time of its ticks in this window, s
     ticks: int = 0  # its ticks in this window
     tick_cost_s: float = 0.0  # mean time of a tick, s
-    warm: int = WARM_TICKS - 1  # its ticks since a return, up to `WARM_TICKS`; one less after a start
+    begun: bool = False  # its first tick since a start or a return, of another cost, is over
     offered: int = 0  # number of samples until this window
     rate: float = 0.0  # samples offered per second
 
@@ -96,6 +94,7 @@ class LoadControl:
     _overloaded: int = 0
     _hold_s: float = HOLD_S
     _last: float | None = None
+    _returned: bool = False  # feeders have returned since the last overload
 
     def count_round(self, lasted_s: float, rounds_s: float, placed_s: float, samples: int) -> None:
         """Add the times of a round as in `Window`, s, and the number of its samples."""
@@ -107,11 +106,11 @@ class LoadControl:
         window.signs += lasted_s > LONG_ROUND_S
 
     def count_tick(self, feeder: str, spent_s: float) -> None:
-        """Add the processor time of a tick, s; the first ones of a feeder do not count in its cost."""
+        """Add the processor time of a tick, s; the first one of a feeder does not count in its cost."""
         load = self.feeders[feeder]
         self.count_forming(feeder, spent_s)
-        load.ticks += load.warm == WARM_TICKS
-        load.warm = 0 if feeder in self.shed else min(WARM_TICKS, load.warm + 1)
+        load.ticks += load.begun
+        load.begun = feeder not in self.shed
 
     def count_forming(self, feeder: str, spent_s: float) -> None:
         """Add the processor time of a part of a tick, s."""
@@ -120,7 +119,7 @@ class LoadControl:
             window.shed_s += spent_s
         else:
             window.judged_s += spent_s
-        if load.warm == WARM_TICKS:
+        if load.begun:
             load.spent_s += spent_s
 
     def count_losses(self, number: int) -> None:
@@ -176,9 +175,9 @@ class LoadControl:
         heavy = window.signs > 0 and max(kept, window.lasted_s / elapsed) > OVERLOADED
         self._overloaded = self._overloaded + 1 if heavy else 0
         if heavy:
-            if self._last is not None and now - self._last < CALM_S and not self.shed:
+            if self._last is not None and now - self._last < CALM_S and self._returned:
                 self._hold_s = min(HOLD_MAX_S, 2.0 * self._hold_s)
-            self._last = now
+            self._last, self._returned = now, False
             if self._overloaded >= LASTING:
                 self._shed_more(kept, now)
         elif self.shed and self._last is not None and now - self._last >= self._hold_s:
@@ -210,21 +209,18 @@ class LoadControl:
         self._forget_costs()
 
     def _forget_costs(self) -> None:
-        """Let the cost of shed and of returned feeders fall to the mean of the others, by their sources.
+        """Let the cost of shed feeders fall to the mean of the monitored ones, by their sources.
 
-        It is not measured meanwhile: one that was large for a short time would keep them out.
+        It is not measured while they are shed: one that was large for a short time would keep them out.
         """
-        cold = [one for name, one in self.feeders.items() if name in self.shed or one.warm < WARM_TICKS]
-        known = [
-            one
-            for name, one in self.feeders.items()
-            if name not in self.shed and one.warm == WARM_TICKS and one.tick_cost_s > 0.0
-        ]
+        known = [one for name, one in self.feeders.items() if name not in self.shed and one.tick_cost_s > 0.0]
         if not known:
             return
         each = sum(one.tick_cost_s for one in known) / sum(one.sources for one in known)
-        for load in cold:
-            load.tick_cost_s += _SMOOTH * min(0.0, each * load.sources - load.tick_cost_s)
+        for name in self.shed:
+            load = self.feeders.get(name)
+            if load is not None:
+                load.tick_cost_s += _SMOOTH * min(0.0, each * load.sources - load.tick_cost_s)
 
     def _shed_more(self, kept: float, now: float) -> None:
         """Shed feeders: floods first, feeders with active alarms last. At least one stays."""
@@ -250,3 +246,4 @@ class LoadControl:
             if kept > KEPT:
                 return
             del self.shed[name]
+            self._returned = True

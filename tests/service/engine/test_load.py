@@ -13,7 +13,7 @@ from gridsec.interface import Cause
 from service.alarms.state_machine import AlarmKind
 from service.engine.engine import Engine, RuntimeConfig
 from service.engine.feeder_monitor import design
-from service.engine.load import HOLD_MAX_S, KEPT, FeederLoad, LoadControl
+from service.engine.load import HOLD_MAX_S, KEPT, RETURNING, RETURNING_MIN, FeederLoad, LoadControl
 from service.ingest.queues import LANE_SAMPLES, Inbox, Sample
 from service.store import Store
 from tests.service.liars import FEEDER, START
@@ -153,17 +153,35 @@ def test_a_flood_is_shed_before_its_neighbours_and_alarms_last() -> None:
     assert machine.shed == {"f1", "f2", "f3"}  # never all
 
 
-def test_returns_become_rarer_while_the_estimate_of_the_load_is_wrong() -> None:
-    machine, times = Machine(4), list[float]()
+def test_feeders_return_in_parts() -> None:
+    machine = Machine(100)
+    for _ in range(4):
+        machine.second(30.0)
+    shed = [len(machine.shed)]
+    assert shed[0] > 70
+    while machine.shed:
+        machine.second(5.0)
+        shed.append(len(machine.shed))
+    back = [before - after for before, after in pairwise(shed) if before > after]
+    assert back[0] == RETURNING_MIN
+    for before, after in pairwise(shed):
+        assert before - after <= max(RETURNING_MIN, RETURNING * (100 - before))
+    assert max(back) > RETURNING_MIN
+
+
+@pytest.mark.parametrize("feeders", [4, 60])
+def test_returns_become_rarer_while_the_estimate_of_the_load_is_wrong(feeders: int) -> None:
+    machine, times = Machine(feeders), list[float]()
     for _ in range(120):
         before = machine.shed
         # The samples of returned feeders cost more than those of the others.
-        machine.second(100.0 if before else 400.0)
+        machine.second((100.0 if before else 400.0) * 4 / feeders)
         if before and not machine.shed:
             times.append(machine.t)
     gaps = [after - one for one, after in pairwise(times)]
     assert gaps == sorted(gaps)
-    assert HOLD_MAX_S <= gaps[-1] <= HOLD_MAX_S + 4.0
+    # Feeders return in parts.
+    assert HOLD_MAX_S <= gaps[-1] <= HOLD_MAX_S + 4.0 + feeders / RETURNING_MIN
 
 
 def test_feeders_return_when_other_processes_end() -> None:

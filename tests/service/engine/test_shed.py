@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,7 @@ class Pair:
 
     def __init__(self, site: Site, store: Store, t: float = START) -> None:
         self.store, self.wall = store, t
+        self.results: list[tuple[str, float]] = []  # feeder and time of each tick
         self.other = from_tables(replace(site.tables, meta=replace(site.tables.meta, name=OTHER)))
         self.box = Inbox(lambda: None, lossless=False, feeder_of=lambda key: key.split("/")[1])
         self.live = Engine(
@@ -64,10 +66,17 @@ class Pair:
                 self.box.put(list(self._samples(name, late if name == OTHER else "")))
             for meter in refused:
                 self.live.monitors[OTHER].refuse(meter, "the signature does not fit")
-            self.live.cycle(self.box.drain(10_000), self.box.oldest)
+            self._cycle(self.box.drain(10_000))
             self.wall += 0.85
-            self.live.cycle([], self.box.oldest)
+            self._cycle([])
             self.wall += 0.1
+
+    def _cycle(self, samples: list[Sample]) -> None:
+        before = {name: monitor.latest for name, monitor in self.live.monitors.items()}
+        self.live.cycle(samples, self.box.oldest)
+        for name, monitor in self.live.monitors.items():
+            if monitor.latest is not None and monitor.latest is not before.get(name):
+                self.results.append((name, monitor.latest.t))
 
     def _samples(self, name: str, late: str) -> Iterator[Sample]:
         for meter in ("substation", *self.other.meter_ids):
@@ -91,27 +100,43 @@ def pair(site: Site, tmp_path: Path) -> Iterator[Pair]:
         yield Pair(site, store)
 
 
-def test_ticks_of_a_shed_feeder_are_rare(pair: Pair) -> None:
-    monitor, ticks = pair.live.monitors[OTHER], list[float]()
+def test_ticks_of_shed_feeders_are_rare_once_they_are_displayed(pair: Pair) -> None:
     pair.run(3)
+    pair.shed(FEEDER, OTHER)
+    pair.run(4)
+    # Display and alarm have their delays as with every other cause.
+    assert pair.live.monitors[OTHER].latest is not None
+    assert pair.live.monitors[OTHER].latest.summary["cause"] is Cause.OVERLOAD
+    assert (AlarmKind.UNDECIDED, None) in pair.standing()
+    pair.results.clear()
+    pair.run(60)
+    for name in (FEEDER, OTHER):
+        ticks = [t for feeder, t in pair.results if feeder == name]
+        assert len(ticks) in (4, 5)
+        assert {round(after - one) for one, after in pairwise(ticks)} == {round(SHED_TICK_S)}
+    # Not in the same round.
+    assert len({t % SHED_TICK_S for _, t in pair.results}) == 2
+    # A skipped tick is a sign of overload.
+    assert [monitor.skipped for monitor in pair.live.monitors.values()] == [0, 0]
+
+
+@pytest.mark.parametrize("rest_s", [16, 29, 44])
+def test_the_return_of_a_shed_feeder_is_one_tick_without_silence(pair: Pair, rest_s: int) -> None:
+    pair.run(14)
     pair.shed(OTHER)
-    for _ in range(40):
-        pair.run(1)
-        report = monitor.report
-        assert report is not None
-        assert report.cause is Cause.OVERLOAD  # from the next tick on
-        assert pair.wall - report.t < SHED_TICK_S + 2.0
-        ticks.append(report.t)
-    assert len(set(ticks)) <= 4
-    # It counts no tick as skipped: that is a sign of overload.
-    assert monitor.skipped == 0
+    pair.run(rest_s)
+    pair.results.clear()
     pair.shed()
-    for _ in range(5):
+    for _ in range(16):
         pair.run(1)
-        assert monitor.latest is not None
-        assert monitor.latest.t > pair.wall - 2.0
-    assert monitor.latest is not None
-    assert monitor.latest.cause is not Cause.OVERLOAD
+        latest = pair.live.monitors[OTHER].latest
+        assert latest is not None
+        assert latest.tick.silent == ()
+        assert latest.t > pair.wall - 2.0
+    ticks = [t for feeder, t in pair.results if feeder == OTHER]
+    assert len(ticks) <= 17
+    assert pair.live.monitors[OTHER].skipped == 0
+    assert not any(alarm.kind is AlarmKind.DATA_LOSS for alarm in pair.store.alarms(feeder=OTHER)[0])
 
 
 def test_a_shed_feeder_can_be_removed(pair: Pair) -> None:
@@ -134,8 +159,7 @@ def test_a_shed_feeder_that_is_put_again_stays_shed(pair: Pair) -> None:
     pair.live.add(pair.other).install(design(pair.other))
     # The count of its samples goes on: the next window sees no flood.
     assert pair.live.load.feeders[OTHER].offered == offered > 0
-    # Its meters are silent first, as after a start.
-    pair.run(int(2 * SHED_TICK_S) + 6)
+    pair.run(16)
     assert (pair.cause(), pair.standing()) == (Cause.OVERLOAD, {(AlarmKind.UNDECIDED, None)})
     pair.shed()
     pair.run(9)
