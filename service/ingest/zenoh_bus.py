@@ -312,15 +312,15 @@ class Bus:
         while not closing.wait(POLL_S):
             batch, begun = list[Sample](), time.monotonic()
             for feeder, (_, handler) in list(self._followed.items()):
+                if closing.is_set():
+                    break
                 # Most of them are empty: the look is the cost.
                 if (first := _try_recv(handler)) is not None:
                     batch += islice(self._copies(_waiting(handler, RING, first), feeder), BATCH)
                 # A flood in all queues makes the look last: the others must not wait for its end.
-                if len(batch) >= BATCH or time.monotonic() - begun > POLL_S:
+                if batch and (len(batch) >= BATCH or time.monotonic() - begun > POLL_S):
                     self._deliver(batch)
                     batch, begun = [], time.monotonic()
-                    if closing.is_set():
-                        return
             if self._others is not None:
                 batch += self._copies(_waiting(self._others[1], BATCH), None)
             if batch:

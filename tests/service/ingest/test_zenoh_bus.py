@@ -42,11 +42,18 @@ class Sink:
 
 @contextmanager
 def pair(
-    sink: Sink, *, lossless: bool = False, max_payload: int = 10_000
+    sink: Sink, *, lossless: bool = False, max_payload: int = 10_000, slow: threading.Event | None = None
 ) -> Iterator[tuple[Bus, MeterClient, str]]:
+    """A bus and its meters; nothing is taken before the event `slow`."""
+
+    def take(batch: list[Sample]) -> None:
+        if slow is not None:
+            slow.wait(20.0)
+        sink(batch)
+
     end = f"tcp/127.0.0.1:{free_port()}"
     with (
-        Bus(BusConfig(listen=(end,)), "gridsec", sink, max_payload=max_payload, lossless=lossless) as bus,
+        Bus(BusConfig(listen=(end,)), "gridsec", take, max_payload=max_payload, lossless=lossless) as bus,
         MeterClient(BusConfig("client", connect=(end,)), "gridsec") as meters,
     ):
         yield bus, meters, end
@@ -143,16 +150,7 @@ def test_a_slow_service_keeps_the_newest_and_does_not_hold_up_the_sender() -> No
 
 def test_a_flood_on_other_keys_displaces_no_sample_of_a_followed_feeder() -> None:
     sink, slow = Sink(), threading.Event()
-
-    def take(batch: list[Sample]) -> None:
-        slow.wait(20.0)
-        sink(batch)
-
-    end = f"tcp/127.0.0.1:{free_port()}"
-    with (
-        Bus(BusConfig(listen=(end,)), "gridsec", take, max_payload=1000, lossless=False) as bus,
-        MeterClient(BusConfig("client", connect=(end,)), "gridsec") as meters,
-    ):
+    with pair(sink, slow=slow) as (bus, meters, _):
         bus.follow("calm")
         bus.follow("calm")
         for k in range(3 * RING):
@@ -176,16 +174,7 @@ def test_a_flood_on_other_keys_displaces_no_sample_of_a_followed_feeder() -> Non
 
 def test_a_flood_on_a_pattern_of_keys_delays_no_sample_of_a_followed_feeder() -> None:
     sink, slow = Sink(), threading.Event()
-
-    def take(batch: list[Sample]) -> None:
-        slow.wait(20.0)
-        sink(batch)
-
-    end = f"tcp/127.0.0.1:{free_port()}"
-    with (
-        Bus(BusConfig(listen=(end,)), "gridsec", take, max_payload=1000, lossless=False) as bus,
-        MeterClient(BusConfig("client", connect=(end,)), "gridsec") as meters,
-    ):
+    with pair(sink, slow=slow) as (bus, meters, _):
         bus.follow("calm")
         meters.put("calm/meter/a/reading", b"first")
         # The ring holds all of them; the reply to the query comes after them.
