@@ -148,12 +148,12 @@ class Metrics:
         self._child(self.delay, feeder).observe(delay_s)
 
     def count_tick(self, state: TickState, alarms: int) -> None:
-        """Count a tick, and show its numbers; `alarms` are the active ones of its feeder.
+        """Count a tick and those it stands for, and show its numbers; `alarms` are the active ones.
 
         Gauges are set when they change.
         """
         feeder = state.feeder
-        self._child(self.ticks, feeder, state.verdict.value).inc()
+        self._child(self.ticks, feeder, state.verdict.value).inc(1 + state.tick.passed_over)
         gauges = (self.seen, self.suspects, self.alarms)
         self._show(feeder, gauges, (int(np.count_nonzero(state.tick.seen)), len(state.suspects), alarms))
         self.count_learning(feeder, state.learning)

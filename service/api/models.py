@@ -212,6 +212,9 @@ class FeederDetail(BaseModel):
     v_max_volt: float
     tick_s: float = 1.0
     patience_s: float | None = Field(default=None, description="Age beyond which a state is stale, s.")
+    patience_shed_s: float | None = Field(
+        default=None, description="Age beyond which a state with cause `overload` is stale, s."
+    )
     revision: str = Field(
         description="Digest of all other fields but `max_attacked`; a state with another one does not belong "
         "to them."

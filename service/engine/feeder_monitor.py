@@ -205,8 +205,6 @@ OVERLOAD_REASON = "not monitored: the service is overloaded, and discards the re
 
 PATIENCE_MIN_S = 5.0
 """Lower limit of `patience_s`, s."""
-SHED_TICK_S = 15.0
-"""Interval of the ticks of a feeder that is displayed as shed, s; one takes as long as one with readings."""
 
 
 class Phase(StrEnum):
@@ -340,6 +338,12 @@ class FeederMonitor:
         rules = self.aligner.rules
         return max(PATIENCE_MIN_S, 3.0 * rules.tick_s + rules.grace_s)
 
+    def stale(self, age_s: float) -> bool:
+        """True if the latest tick, of this age, s, is late; those that display the overload are rare."""
+        told = self.latest
+        rare = told is not None and told.summary["cause"] is Cause.OVERLOAD
+        return age_s > self.patience_s + (feeder_info.SHED_TICK_S if rare else 0.0)
+
     @cached_property
     def revision(self) -> str:
         """Revision in its reports, against reading them with the meters of other tables."""
@@ -408,7 +412,7 @@ class FeederMonitor:
     def wake(self) -> float | None:
         """Latest wall time of the next tick, Unix s; None if only readings can cause one."""
         wake, tick_s = self.aligner.wake(), self.aligner.rules.tick_s
-        every = int(SHED_TICK_S / tick_s)
+        every = int(feeder_info.SHED_TICK_S / tick_s)
         if wake is None or every < 2 or not self._rests:
             return wake
         # Shed feeders have their ticks in different seconds.
@@ -417,10 +421,11 @@ class FeederMonitor:
     def reach(self, now: float) -> None:
         """Add the ticks that are due without a new reading to the pending ones; at rest only the newest."""
         rests = self._rests
-        if rests:
-            self.aligner.pass_over(now)
+        passed = self.aligner.pass_over(now) if rests else 0
         ticks = list(self.aligner.due(now))
-        self.pending.extend(ticks[-1:] if rests else ticks)
+        if rests and ticks:
+            ticks = [replace(ticks[-1], passed_over=passed + len(ticks) - 1)]
+        self.pending.extend(ticks)
 
     def skip(self, count: int) -> None:
         """Drop the oldest pending ticks without evaluation; the next one counts them.

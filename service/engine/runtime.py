@@ -513,8 +513,8 @@ class Runtime:
             elif monitor.phase is Phase.FAILED:
                 problems.append(f"feeder {monitor.name}: {monitor.problem}")
             # With `Clock.EVENTS` the time may stand still.
-            told, waits = monitor.latest, engine.config.clock is Clock.WALL and not monitor.shed
-            if waits and told is not None and (age := self.age(told)) > monitor.patience_s:
+            told, waits = monitor.latest, engine.config.clock is Clock.WALL
+            if waits and told is not None and monitor.stale(age := self.age(told)):
                 problems.append(f"feeder {monitor.name}: the latest report is {age:.0f} s old")
         if shed := len(self._inbox.shed):
             problems.append(f"overload: {shed} of {len(engine.monitors)} feeders are not monitored")

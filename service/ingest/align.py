@@ -153,6 +153,7 @@ class Tick:
     v_phases: tuple[float, ...] | None = None  # voltages of the busbar's phases, V, as in `Reading`
     # Sources with a measured clock offset, None for the busbar meter; None where the clock measures none.
     clocks_known: frozenset[str | None] | None = None
+    passed_over: int = 0  # number of ticks of a shed feeder directly before this one, which stands for them
 
     @property
     def seen(self) -> Bools:
@@ -659,12 +660,15 @@ class Aligner:
             self._resumed = self._time(self._next)
             self._turn_to(self._next)
 
-    def pass_over(self, wall: float) -> None:
-        """Do not form the ticks before the newest one that is due at the wall time, Unix s."""
-        if self._next is not None:
-            newest = math.floor((wall - self.rules.grace_s) / self.rules.tick_s)
-            if newest > self._next:
-                self._turn_to(newest)
+    def pass_over(self, wall: float) -> int:
+        """Pass over the ticks before the newest one due at the wall time, Unix s; return their number."""
+        if self._next is None:
+            return 0
+        newest = math.floor((wall - self.rules.grace_s) / self.rules.tick_s)
+        passed = max(0, newest - self._next)
+        if passed:
+            self._turn_to(newest)
+        return passed
 
     def flush(self) -> Iterator[Tick]:
         """Emit every tick that the time has reached, without grace: the input has ended."""

@@ -36,6 +36,10 @@ UNWATCHED = frozenset({"overload", "no-owner"})
 """Causes of feeders without an evaluation of their readings: undecided, and not a lack of data."""
 
 
+SHED_TICK_S = 15.0
+"""Interval of the ticks of a feeder that is displayed as shed, s; one takes as long as one with readings."""
+
+
 def status_of(now: Mapping[str, Any], patience_s: float | None, *, failed: bool = False) -> FeederStatus:
     """Return the status of a feeder: its displayed verdict, unless no value uses a present reading.
 
@@ -95,7 +99,7 @@ def revision(fields: Mapping[str, Any]) -> str:
 def detail(site: Site, patience_s: float) -> dict[str, Any]:
     """Return all properties of a feeder's files: limits, tree with positions, tables, and their `revision`.
 
-    Reports older than `patience_s`, s, are stale.
+    Reports older than `patience_s`, s, are stale; those of a shed feeder later by the interval of its ticks.
     """
     meta = site.tables.meta
     tree = site.spanning
@@ -103,6 +107,7 @@ def detail(site: Site, patience_s: float) -> dict[str, Any]:
     fields = {
         **summary(site),
         "patience_s": patience_s,
+        "patience_shed_s": patience_s + SHED_TICK_S,
         "v_nominal_volt": meta.voltage_volt,
         "v_min_volt": meta.limits.v_min_pu * meta.voltage_volt,
         "v_max_volt": meta.limits.v_max_pu * meta.voltage_volt,

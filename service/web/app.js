@@ -14,8 +14,6 @@ import { Series } from "./series.js";
 
 const API = "/api/v1/feeders";
 const KEPT = 600;
-// Interval of the states of a feeder that is not evaluated, s.
-const SHED_TICK_S = 15;
 
 const page = { feeder: null, report: null, refused: null, code: null, selected: null, source: null, retry: null, heard: null, word: "…", others: 0, linked: true, alarmsLinked: true, past: new Map(), turn: 0 };
 const diagram = new Diagram({ onSelect: (id) => select(id === page.selected ? null : id) });
@@ -217,7 +215,7 @@ function fresh() {
   const age = page.heard === null ? null : (performance.now() - page.heard) / 1000;
   const waiting = page.report === null;
   const apart = APART[(page.report?.displayed ?? page.report)?.cause];
-  const stale = age !== null && age > page.feeder.patience_s + (apart ? SHED_TICK_S : 0);
+  const stale = age !== null && age > (apart ? page.feeder.patience_shed_s : page.feeder.patience_s);
   const state = !page.linked ? "lost" : stale ? "stale" : page.refused ? "refused" : waiting ? "connecting" : page.report.model_only ? (apart ? "apart" : "nodata") : "live";
   const shown = state === "live" && !page.alarmsLinked ? "alarms" : state;
   const words = {

@@ -40,7 +40,7 @@ from service.api.system import Probe
 from service.engine.commissioning import CommissioningProgress
 from service.engine.operators import SHELVE_MOST_S, Operators
 from service.errors import FeederFixed, FeederUnknown, TooManyFeeders
-from service.report.feeder_info import numbers, revision
+from service.report.feeder_info import SHED_TICK_S, numbers, revision
 from service.report.report import BusState, FeederReport, MeterState, Silence
 from service.store import Store
 from service.store.committer import Wish
@@ -92,6 +92,7 @@ class Village:
             "v_max_volt": 1.1 * NOMINAL,
             "tick_s": 1.0,
             "patience_s": STALE_S,
+            "patience_shed_s": STALE_S + SHED_TICK_S,
             "layout": {"buses": self.buses, "parent": self.parent, "xy": None, "customers": self.customers},
             "tables": {"meta": {"name": self.name}, "lines": [], "customers": []},
         }

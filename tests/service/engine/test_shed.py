@@ -14,9 +14,10 @@ from feeders.model.site import Site, from_tables
 from gridsec.interface import Cause
 from service.alarms.state_machine import AlarmKind
 from service.engine.engine import Engine, RuntimeConfig
-from service.engine.feeder_monitor import MISMATCH_S, SHED_TICK_S, design
+from service.engine.feeder_monitor import MISMATCH_S, design
 from service.ingest.align import Clock
 from service.ingest.queues import Inbox, Sample
+from service.report.feeder_info import SHED_TICK_S
 from service.store import Store
 from tests.service.liars import FEEDER, START
 
@@ -88,6 +89,12 @@ class Pair:
     def standing(self) -> set[tuple[AlarmKind, str | None]]:
         return {(alarm.kind, alarm.meter) for alarm in self.store.active(OTHER)}
 
+    def undecided(self) -> float:
+        """Number of UNDECIDED ticks of the second feeder in the metrics."""
+        lines = self.live.metrics.exposition().decode().splitlines()
+        start = f'gridsec_ticks_total{{feeder="{OTHER}",verdict="undecided"}} '
+        return sum(float(line.removeprefix(start)) for line in lines if line.startswith(start))
+
     def cause(self) -> Cause:
         report = self.live.monitors[OTHER].report
         assert report is not None
@@ -109,7 +116,10 @@ def test_ticks_of_shed_feeders_are_rare_once_they_are_displayed(pair: Pair) -> N
     assert pair.live.monitors[OTHER].latest.summary["cause"] is Cause.OVERLOAD
     assert (AlarmKind.UNDECIDED, None) in pair.standing()
     pair.results.clear()
+    before = pair.undecided()
     pair.run(60)
+    # A rare tick stands for those that were not formed: shares of ticks are shares of time.
+    assert pair.undecided() - before == pytest.approx(60, abs=SHED_TICK_S)
     for name in (FEEDER, OTHER):
         ticks = [t for feeder, t in pair.results if feeder == name]
         assert len(ticks) in (4, 5)
@@ -118,6 +128,34 @@ def test_ticks_of_shed_feeders_are_rare_once_they_are_displayed(pair: Pair) -> N
     assert len({t % SHED_TICK_S for _, t in pair.results}) == 2
     # A skipped tick is a sign of overload.
     assert [monitor.skipped for monitor in pair.live.monitors.values()] == [0, 0]
+
+
+def test_rare_states_of_a_shed_feeder_are_not_stale(pair: Pair) -> None:
+    monitor = pair.live.monitors[OTHER]
+
+    def age() -> float:
+        assert monitor.latest is not None
+        return pair.wall - monitor.latest.t
+
+    pair.run(14)
+    assert monitor.stale(monitor.patience_s + 0.1)
+    pair.shed(OTHER)
+    ages = []
+    for _ in range(3 * round(SHED_TICK_S)):
+        pair.run(1)
+        ages.append(age())
+        assert not monitor.stale(ages[-1])
+    assert max(ages) > SHED_TICK_S - 2.0
+    while age() < SHED_TICK_S - 2.0:
+        pair.run(1)
+    pair.shed()
+    # The latest state is still the rare one until the first tick after the return.
+    assert age() > monitor.patience_s
+    assert not monitor.stale(age())
+    assert monitor.stale(monitor.patience_s + SHED_TICK_S + 0.1)
+    pair.run(8)
+    assert not monitor.stale(age())
+    assert monitor.stale(monitor.patience_s + 0.1)
 
 
 @pytest.mark.parametrize("rest_s", [16, 29, 44])

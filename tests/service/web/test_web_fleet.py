@@ -42,6 +42,26 @@ def tick(site: Site, village: Any, t: float, **changes: Any) -> None:
     site.service.tick(village.report(t, **changes))
 
 
+def not_evaluated(village: Any) -> Any:
+    """Report of a shed feeder."""
+    blind = village.report(T0, cause=Cause.OVERLOAD)
+    unseen = {"seen": False, "model_only": True, "v_volt_reported": None, "score": None}
+    meters = tuple(replace(meter, **unseen) for meter in blind.meters)
+    return replace(blind, meters=meters, model_only=True)
+
+
+@pytest.mark.parametrize(("later_s", "words"), [(-2.0, "not evaluated"), (1.0, "data stale")])
+def test_rare_states_of_a_shed_feeder_are_stale_later(
+    site_of: Callable[..., Site], village: Callable[..., Any], later_s: float, words: str
+) -> None:
+    shed = village("shed", 4)
+    site = site_of(shed)
+    site.service.tick(not_evaluated(shed))
+    site.service.delay_s = shed.detail()["patience_shed_s"] + later_s
+    page = site.open()
+    expect(page.locator("#link")).to_contain_text(words)
+
+
 @pytest.mark.canary("phone")
 @LOOKS
 def test_the_worst_feeder_comes_first(
@@ -102,10 +122,7 @@ def test_feeders_that_are_not_evaluated_never_look_clean(
     site.expected = "503"
     tick(site, quiet, T0)
     tick(site, lost, T0)
-    blind = shed.report(T0, cause=Cause.OVERLOAD)
-    unseen = {"seen": False, "model_only": True, "v_volt_reported": None, "score": None}
-    meters = tuple(replace(meter, **unseen) for meter in blind.meters)
-    site.service.tick(replace(blind, meters=meters, model_only=True))
+    site.service.tick(not_evaluated(shed))
     plain = site.service.summary
     gone = {"cause": "no-owner", "verdict": "undecided", "displayed_verdict": "undecided", "since": None}
     site.service.summary = lambda name: {**plain(name), **(gone if name == "c-lost" else {})}
