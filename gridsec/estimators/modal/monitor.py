@@ -13,9 +13,10 @@ A step, by module:
     verdict                         evidence of each meter, decision, explanations
 
 The residual of a meter is its squared reading less the model; fixed errors are states of the filter. A meter
-is named when `CONFIRM` searches in turn name it, or when it repeats its readings beyond chance. Named meters
-are masked from the onset of the manipulation on, and released by their readings (`masking`). The busbar's
-meter is named likewise; its phase then counts as not metered, until the meters agree with its reading again.
+is named when `CONFIRM` searches in turn name it, when a search from an onset of this age names it alone, or
+when it repeats its readings beyond chance. Named meters are masked from the onset of the manipulation on, and
+released by their readings (`masking`). The busbar's meter is named by searches in turn; its phase then counts
+as not metered, until the meters agree with its reading again.
 """
 
 from __future__ import annotations
@@ -82,7 +83,10 @@ from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.certificates import Certificate
 
 CONFIRM = 2
-"""Searches in turn that name a meter before it is named: one reading may be an outlier."""
+"""Searches in turn that name a fault before it is named, and readings since the onset that name a sole meter.
+
+One reading may be an outlier, and the first explanation of several faults a part of them.
+"""
 LOOKS = 16
 """Searches per age of the suspected onset: explanations change ever more slowly."""
 SETTLING = 32
@@ -376,7 +380,8 @@ def _identified(
     after = replace(
         state, suspicion=suspicion, streak=streak, phases=phases, inverters=inverters, due=tick + wait
     )
-    confirmed = streak >= CONFIRM
+    sole = age >= CONFIRM and np.count_nonzero(named) == 1
+    confirmed = named if sole else streak >= CONFIRM
     if any_of(confirmed):
         found = replace(suspicion.found, named=confirmed)
         masked, evidence = core.mask(kernel, state.core, replace(suspicion, found=found))
