@@ -39,7 +39,7 @@ from gridsec.arrays import Floats, Ints
 from gridsec.estimators.modal import core, verdict
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
-from gridsec.estimators.modal.monitor import CONFIRM, LOOKS
+from gridsec.estimators.modal.monitor import CONFIRM, LOOKS, confirmed
 from gridsec.grid.network import Power
 
 QUIET, WATCHED, RAMP = 60, 60, 90
@@ -109,9 +109,10 @@ class Watch:
         age = int(self.state.detector.onsets.age[found.row])
         self.suspicion, self.streak = found, streak
         self.due = tick + (1 if (streak == 1).any() or self.phases == 1 else max(1, age // LOOKS))
-        if (streak >= CONFIRM).any():
-            confirmed = replace(found, found=replace(found.found, named=streak >= CONFIRM))
-            self.state, _ = core.mask(self.kernel, self.state, confirmed)
+        sure = confirmed(named, streak, age)
+        if sure.any():
+            final = replace(found, found=replace(found.found, named=sure))
+            self.state, _ = core.mask(self.kernel, self.state, final)
             self.suspicion, self.streak, self.due = None, 0, tick + 1
 
 

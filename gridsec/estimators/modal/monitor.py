@@ -380,10 +380,9 @@ def _identified(
     after = replace(
         state, suspicion=suspicion, streak=streak, phases=phases, inverters=inverters, due=tick + wait
     )
-    sole = age >= CONFIRM and np.count_nonzero(named) == 1
-    confirmed = named if sole else streak >= CONFIRM
-    if any_of(confirmed):
-        found = replace(suspicion.found, named=confirmed)
+    sure = confirmed(named, streak, age)
+    if any_of(sure):
+        found = replace(suspicion.found, named=sure)
         masked, evidence = core.mask(kernel, state.core, replace(suspicion, found=found))
         return replace(after, core=masked, suspicion=None, streak=0 * streak, due=tick + 1), evidence
     if any_of(phases >= CONFIRM):
@@ -395,6 +394,22 @@ def _identified(
         if adopted is not state.core:
             return replace(after, core=adopted, suspicion=None), evidence
     return after, evidence
+
+
+def confirmed(named: Bools, streak: Ints, age: int) -> Bools:
+    """Meters that a search names finally, (p,).
+
+    Parameters
+    ----------
+    named : (p,)
+        Meters that it names.
+    streak : (p,)
+        Searches in turn that name each.
+    age
+        Readings since the suspected onset.
+    """
+    sole = age >= CONFIRM and np.count_nonzero(named) == 1
+    return named if sole else np.asarray(streak >= CONFIRM)
 
 
 def _unsuspected(state: ModalState) -> ModalState:

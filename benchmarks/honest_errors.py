@@ -1,0 +1,124 @@
+"""Errors of the honest voltages by `sequential` and `modal`, with lines that are longer than in the files.
+
+    python -m benchmarks.honest_errors [runs] [feeder ...]
+
+AC power flow on a feeder with all lines longer by `LONGER`, designs for the lines of the files. No
+manipulation, one frame in `STEP_S`, errors of powers and meters as the files say. Both estimators have the
+same frames and no learned errors.
+
+Columns: root mean square error of all customers' voltages after `SETTLING` frames, mV, and the ratio of
+`modal` to `sequential`; root mean square of the errors over their stated standard deviations; frames that
+are not CLEAN, and honest meters that are named.
+"""
+
+from __future__ import annotations
+
+import os
+
+# Before NumPy loads its libraries.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from benchmarks._arguments import arguments
+from benchmarks.limits import head, row
+from feeders.model.site import Site, from_tables, load
+from feeders.registry import MODAL, SEQUENTIAL, design
+from feeders.simulation.trial import Trial, TrialMeterErrors, frames
+from feeders.studies.calibrate.search import longer
+from gridsec.arrays import Floats
+from gridsec.interface import Decision
+
+LONGER = (1.0, 1.1, 1.2)
+"""Lengths of the lines over those of the files."""
+STEP_S, FRAMES, SETTLING = 5.0, 240, 60
+"""Interval of the frames, s; their number; those before the first error that counts."""
+FEEDERS = (
+    "case33bw",
+    "cigre-lv",
+    "ieee-european-lv",
+    "kerber-dorfnetz",
+    "kerber-landnetz",
+    "kerber-vorstadtnetz",
+    "simbench-lv-rural1",
+    "simbench-lv-rural3",
+)
+
+
+@dataclass(slots=True)
+class Errors:
+    """Squared errors of one estimator, their ratios to the stated variances, and wrong answers."""
+
+    squares: list[Floats] = field(default_factory=list)
+    ratios: list[Floats] = field(default_factory=list)
+    not_clean: int = 0
+    named: int = 0
+
+    @property
+    def rms(self) -> tuple[float, float]:
+        """Root mean squares of the errors, V, and over the standard deviations."""
+        return float(np.sqrt(np.mean(self.squares))), float(np.sqrt(np.mean(self.ratios)))
+
+
+def errors(where: Site, factor: float, seed: int, into: dict[str, Errors]) -> None:
+    """Add the errors of one run."""
+    lines = tuple(longer(line, factor) for line in where.tables.lines)
+    truth = from_tables(replace(where.tables, lines=lines))
+    trial = Trial(
+        truth,
+        seed=seed,
+        duration_s=STEP_S * FRAMES,
+        step_s=STEP_S,
+        load_error=None,
+        meters=TrialMeterErrors.SITE,
+    )
+    stated = Trial(where, step_s=STEP_S, load_error=None, meters=TrialMeterErrors.SITE).stated.tables
+    played = list(frames(trial))
+    volt = where.customer_volt
+    for name, out in into.items():
+        settings = replace(stated.meta.monitor, commission_s=0.0, estimator=name)
+        made = design(from_tables(replace(stated, meta=replace(stated.meta, monitor=settings))))
+        state = made.init(played[0][0].t)
+        for k, (frame, exact) in enumerate(played):
+            state, estimate, verdict = made.step(state, frame)
+            if k < SETTLING:
+                continue
+            apart = estimate.v2 - exact.v2
+            out.squares.append((volt * 0.5 * apart / np.sqrt(exact.v2)) ** 2)
+            out.ratios.append((apart / estimate.std) ** 2)
+            out.not_clean += verdict.decision is not Decision.CLEAN
+            out.named += int(verdict.suspects.sum())
+
+
+def main(runs: int, names: tuple[str, ...]) -> None:
+    """One table."""
+    head(
+        "feeder",
+        "lines",
+        "error, mV",
+        "`modal`",
+        "ratio",
+        "over std",
+        "`modal`",
+        "not CLEAN, named",
+        "`modal`",
+    )
+    for name in names:
+        where = load(name)
+        for factor in LONGER:
+            found = {SEQUENTIAL: Errors(), MODAL: Errors()}
+            for seed in range(runs):
+                errors(where, factor, seed, found)
+            now, new = found[SEQUENTIAL], found[MODAL]
+            volts = [f"{1e3 * one.rms[0]:.0f}" for one in (now, new)]
+            ratios = [f"{one.rms[1]:.2f}" for one in (now, new)]
+            counts = [f"{one.not_clean}, {one.named}" for one in (now, new)]
+            row(name, f"{factor:g}", *volts, f"{new.rms[0] / now.rms[0]:.2f}", *ratios, *counts)
+
+
+if __name__ == "__main__":
+    asked = arguments(__doc__, runs=2, feeders=FEEDERS)
+    main(asked.runs, tuple(asked.feeders))
