@@ -270,7 +270,7 @@ class Engine:
         self._marks: dict[str, Mark] = {}
         self._wakes: dict[str, float] = {}
         self._until = self._order_kept = -math.inf
-        self.load = LoadControl(clock)
+        self.load = LoadControl(clock, lambda name: bool(self.metrics.active(name)))
         self._clock, self._orphans = clock, Orphans()
         for site in sites:
             self.add(site)
@@ -543,11 +543,7 @@ class Engine:
         `dropped` is the number of samples that the queue has dropped since the last call.
         """
         self.load.count_losses(dropped)
-        if not self.load.due:
-            return
-        for name, load in self.load.feeders.items():
-            load.standing = bool(self.metrics.active(name))
-        if self.load.update(inbox.offered()):
+        if self.load.update(inbox.offered):
             self.follow_load(inbox)
 
     def follow_load(self, inbox: Inbox) -> None:

@@ -51,7 +51,6 @@ class FeederLoad:
 
     tick_s: float  # interval of its ticks, s
     sources: int  # number of its meters, the busbar meter included
-    standing: bool = False  # it has active alarms
     spent_s: float = 0.0  # processor time of its ticks in this window, s
     ticks: int = 0  # its ticks in this window
     tick_cost_s: float = 0.0  # mean time of a tick, s
@@ -79,11 +78,13 @@ class LoadControl:
     """Selection of the feeders that are not monitored.
 
     clock: monotonic time, s.
+    standing: True for a feeder with active alarms.
     feeders: load of each feeder, by its name.
     shed: feeders that are not monitored, in the order of the decisions.
     """
 
     clock: Callable[[], float]
+    standing: Callable[[str], bool] = lambda _: False
     feeders: dict[str, FeederLoad] = field(default_factory=dict)
     shed: dict[str, float] = field(default_factory=dict)
     _window: Window | None = None
@@ -152,21 +153,16 @@ class LoadControl:
         }
         return {name: round(value, 2) for name, value in figures.items()}
 
-    @property
-    def due(self) -> bool:
-        """True at the end of a window."""
-        return self.clock() - self._now().begun >= WINDOW_S
-
-    def update(self, offered: Mapping[str, int]) -> bool:
+    def update(self, offered: Callable[[], Mapping[str, int]]) -> bool:
         """Decide at the end of a window; return True if `shed` has changed.
 
-        `offered` is the number of samples of each feeder so far.
+        `offered` returns the number of samples of each feeder so far.
         """
-        if not self.due:
-            return False
         window, now = self._now(), self.clock()
         elapsed = now - window.begun
-        self._measure(window, elapsed, offered)
+        if elapsed < WINDOW_S:
+            return False
+        self._measure(window, elapsed, offered())
         self._window = Window(now)
         before = set(self.shed)
         for name in before - self.feeders.keys():
@@ -228,7 +224,7 @@ class LoadControl:
         def order(name: str) -> tuple[bool, bool, str]:
             load = self.feeders[name]
             flood = load.rate * load.tick_s > FLOOD * load.sources
-            return not flood, load.standing, name
+            return not flood, self.standing(name), name
 
         monitored = sorted((name for name in self.feeders if name not in self.shed), key=order)
         for name in monitored[:-1]:

@@ -56,7 +56,7 @@ class Machine:
         spent = done * capacity
         self.control.count_round(done, spent, spent, int(done / cost_s))
         self.control.count_losses(int(work > 1.0))
-        self.control.update(self.offered)
+        self.control.update(lambda: self.offered)
 
 
 def test_feeders_are_shed_under_lasting_overload_and_return_at_once() -> None:
@@ -90,7 +90,7 @@ def test_a_costly_start_of_all_feeders_does_not_keep_them_out() -> None:
         machine.t += 1.0
         control.count_round(min(1.0, work), min(1.0, work), 0.0, 0)
         control.count_losses(int(work > 1.0))
-        control.update(machine.offered)
+        control.update(lambda: machine.offered)
 
     for _ in range(5):
         second(0.12)
@@ -127,7 +127,7 @@ def test_ticks_of_shed_feeders_keep_no_feeder_out() -> None:
         machine.t += 1.0
         control.count_round(min(1.0, work), min(1.0, work), 1e-4 * samples, samples)
         control.count_losses(int(work > 1.0))
-        control.update(machine.offered)
+        control.update(lambda: machine.offered)
 
     for _ in range(8):
         second(0.015)
@@ -142,12 +142,12 @@ def test_ticks_of_shed_feeders_keep_no_feeder_out() -> None:
 
 def test_a_flood_is_shed_before_its_neighbours_and_alarms_last() -> None:
     machine = Machine(5)
-    machine.control.feeders["f0"].standing = True
+    machine.control.standing = lambda name: name == "f0"
     for _ in range(5):
         machine.second(20.0, only={"f3": 2000.0})
     assert machine.shed == {"f3"}
     machine = Machine(4)
-    machine.control.feeders["f0"].standing = True
+    machine.control.standing = lambda name: name == "f0"
     for _ in range(4):
         machine.second(600.0)
     assert machine.shed == {"f1", "f2", "f3"}  # never all
