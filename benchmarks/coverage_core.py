@@ -109,7 +109,7 @@ class Watch:
         age = int(self.state.detector.onsets.age[found.row])
         self.suspicion, self.streak = found, streak
         self.due = tick + (1 if (streak == 1).any() or self.phases == 1 else max(1, age // LOOKS))
-        sure = confirmed(named, streak, age)
+        sure = confirmed(found.found, named, streak, self.state.history.readings[-age:])
         if sure.any():
             final = replace(found, found=replace(found.found, named=sure))
             self.state, _ = core.mask(self.kernel, self.state, final)

@@ -2,13 +2,13 @@
 
     python -m benchmarks.honest_errors [runs] [feeder ...]
 
-AC power flow on a feeder with all lines longer by `LONGER`, designs for the lines of the files. No
-manipulation, one frame in `STEP_S`, errors of powers and meters as the files say. Both estimators have the
+AC power flow on a feeder with lines `LONGER` times as long as in the files, designs for those of the files.
+No manipulation, one frame in `STEP_S`, errors of powers and meters as the files say. Both estimators have the
 same frames and no learned errors.
 
 Columns: root mean square error of all customers' voltages after `SETTLING` frames, mV, and the ratio of
-`modal` to `sequential`; root mean square of the errors over their stated standard deviations; frames that
-are not CLEAN, and honest meters that are named.
+`modal` to `sequential`; root mean square of the errors over their stated standard deviations; those
+frames that are not CLEAN, and honest meters that are named.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ import numpy as np
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
 from gridsec.estimators.sequential import LearningReason, LearningState
+from gridsec.interface import Decision
 from service.ingest.align import ReadingOutcome
 from service.ingest.queues import BusCounts
 from service.logs import LineLogger
@@ -57,7 +58,11 @@ class Metrics:
     def _of_ticks(self, registry: CollectorRegistry) -> None:
         """Metrics of the evaluation."""
         counter, gauge = partial(Counter, registry=registry), partial(Gauge, registry=registry)
-        self.ticks = counter("gridsec_ticks", "Ticks, by verdict.", ["feeder", "verdict"])
+        self.ticks = counter(
+            "gridsec_ticks",
+            "Ticks, by verdict; those passed over while shed are undecided.",
+            ["feeder", "verdict"],
+        )
         self.skipped = counter("gridsec_ticks_skipped", "Skipped ticks.", ["feeder"])
         self.observers = counter(
             "gridsec_observer_starts",
@@ -147,13 +152,19 @@ class Metrics:
         """Count the time from a tick to its result."""
         self._child(self.delay, feeder).observe(delay_s)
 
-    def count_tick(self, state: TickState, alarms: int) -> None:
-        """Count a tick and those it stands for, and show its numbers; `alarms` are the active ones.
+    def count_passed_over(self, feeder: str, count: int) -> None:
+        """Count ticks of a shed feeder that are not formed."""
+        if count:
+            self._child(self.ticks, feeder, Decision.UNDECIDED.value).inc(count)
 
-        Gauges are set when they change.
+    def count_tick(self, state: TickState, alarms: int) -> None:
+        """Count a tick and those passed over before it, and show its numbers.
+
+        `alarms` is the number of active alarms of its feeder. Gauges are set when they change.
         """
         feeder = state.feeder
-        self._child(self.ticks, feeder, state.verdict.value).inc(1 + state.tick.passed_over)
+        self._child(self.ticks, feeder, state.verdict.value).inc()
+        self.count_passed_over(feeder, state.tick.passed_over)
         gauges = (self.seen, self.suspects, self.alarms)
         self._show(feeder, gauges, (int(np.count_nonzero(state.tick.seen)), len(state.suspects), alarms))
         self.count_learning(feeder, state.learning)

@@ -556,7 +556,7 @@ class Engine:
             monitor = self.monitors.get(name)
             if monitor is None:  # a removed feeder
                 continue
-            monitor.set_shed(name in shed, self._wall())
+            self.metrics.count_passed_over(name, monitor.set_shed(name in shed, self._wall()))
             self._set_wake(monitor)
         self.metrics.shed.set(len(shed))
         told = {"feeders": len(shed), "changed": changed[:SHOWN], **self.load.figures()}

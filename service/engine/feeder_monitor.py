@@ -342,7 +342,8 @@ class FeederMonitor:
         """True if the latest tick, of this age, s, is late; those that display the overload are rare."""
         told = self.latest
         rare = told is not None and told.summary["cause"] is Cause.OVERLOAD
-        return age_s > self.patience_s + (feeder_info.SHED_TICK_S if rare else 0.0)
+        tick_s = self.aligner.rules.tick_s
+        return age_s > self.patience_s + (tick_s * (feeder_info.rare_ticks(tick_s) - 1) if rare else 0.0)
 
     @cached_property
     def revision(self) -> str:
@@ -412,19 +413,26 @@ class FeederMonitor:
     def wake(self) -> float | None:
         """Latest wall time of the next tick, Unix s; None if only readings can cause one."""
         wake, tick_s = self.aligner.wake(), self.aligner.rules.tick_s
-        every = int(feeder_info.SHED_TICK_S / tick_s)
-        if wake is None or every < 2 or not self._rests:
+        every = feeder_info.rare_ticks(tick_s)
+        if wake is None or every == 1 or not self._rests:
             return wake
         # Shed feeders have their ticks in different seconds.
         return wake + tick_s * ((crc32(self.name.encode()) - math.floor(wake / tick_s)) % every)
 
     def reach(self, now: float) -> None:
-        """Add the ticks that are due without a new reading to the pending ones; at rest only the newest."""
+        """Add the ticks that are due without a new reading to the pending ones.
+
+        At rest only the newest: it stands for those since the last one. Beyond the interval of such ticks, as
+        after a leap of the clock, ticks are skipped.
+        """
         rests = self._rests
         passed = self.aligner.pass_over(now) if rests else 0
         ticks = list(self.aligner.due(now))
         if rests and ticks:
-            ticks = [replace(ticks[-1], passed_over=passed + len(ticks) - 1)]
+            passed += len(ticks) - 1
+            rare = min(passed, 2 * feeder_info.rare_ticks(self.aligner.rules.tick_s))
+            last = ticks[-1]
+            ticks = [replace(last, passed_over=rare, skipped=last.skipped + passed - rare)]
         self.pending.extend(ticks)
 
     def skip(self, count: int) -> None:
@@ -432,7 +440,8 @@ class FeederMonitor:
 
         `count` is less than the number of pending ticks.
         """
-        gone = sum(self.pending.popleft().skipped + 1 for _ in range(count))
+        dropped = [self.pending.popleft() for _ in range(count)]
+        gone = sum(tick.skipped + tick.passed_over + 1 for tick in dropped)
         following = self.pending[0]
         self.pending[0] = replace(following, skipped=following.skipped + gone)
 
@@ -442,14 +451,17 @@ class FeederMonitor:
         self.skipped += tick.skipped
         return self._result(tick)
 
-    def set_shed(self, shed: bool, now: float) -> None:
-        """Begin or end the time without monitoring at the wall time, Unix s; it is no evidence of silence."""
-        if self._rests:
-            self.aligner.pass_over(now)
+    def set_shed(self, shed: bool, now: float) -> int:
+        """Begin or end the time without monitoring at the wall time, Unix s; it is no evidence of silence.
+
+        Returns the number of ticks that are passed over by it.
+        """
+        passed = self.aligner.pass_over(now) if self._rests else 0
         self.shed = shed
         self.aligner.excuse()
         # Nothing is decoded meanwhile: problems of refused identities last from the return on.
         self._refused = {meter: problem for meter, (_, problem) in self._mismatches.items()} | self._refused
+        return passed
 
     def finish(self) -> None:
         """Add all ticks that the time has reached to the pending ones: the input has ended."""

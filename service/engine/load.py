@@ -84,7 +84,7 @@ class LoadControl:
     """
 
     clock: Callable[[], float]
-    standing: Callable[[str], bool] = lambda _: False
+    standing: Callable[[str], bool]
     feeders: dict[str, FeederLoad] = field(default_factory=dict)
     shed: dict[str, float] = field(default_factory=dict)
     _window: Window | None = None

@@ -37,7 +37,7 @@ from service.ingest.queues import (
 RING = 4096
 """Capacity of a subscription's queue, samples: a reading of each of 1 000 meters for four seconds.
 
-Each waiting sample may keep a receive buffer of 64 KiB; a flood by one peer took 10 to 20 kB for each.
+Each waiting sample may keep a receive buffer of 64 KiB; a flood by one peer took 12 to 25 kB for each.
 """
 POLL_S = 0.02
 """Pause between two looks at the queues, s.

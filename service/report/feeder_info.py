@@ -40,6 +40,11 @@ SHED_TICK_S = 15.0
 """Interval of the ticks of a feeder that is displayed as shed, s; one takes as long as one with readings."""
 
 
+def rare_ticks(tick_s: float) -> int:
+    """Return the number of tick intervals, `tick_s` each, from one tick of a shed feeder to the next."""
+    return max(1, int(SHED_TICK_S / tick_s))
+
+
 def status_of(now: Mapping[str, Any], patience_s: float | None, *, failed: bool = False) -> FeederStatus:
     """Return the status of a feeder: its displayed verdict, unless no value uses a present reading.
 
@@ -107,7 +112,7 @@ def detail(site: Site, patience_s: float) -> dict[str, Any]:
     fields = {
         **summary(site),
         "patience_s": patience_s,
-        "patience_shed_s": patience_s + SHED_TICK_S,
+        "patience_shed_s": patience_s + (rare_ticks(meta.monitor.tick_s) - 1) * meta.monitor.tick_s,
         "v_nominal_volt": meta.voltage_volt,
         "v_min_volt": meta.limits.v_min_pu * meta.voltage_volt,
         "v_max_volt": meta.limits.v_max_pu * meta.voltage_volt,

@@ -215,7 +215,7 @@ function fresh() {
   const age = page.heard === null ? null : (performance.now() - page.heard) / 1000;
   const waiting = page.report === null;
   const apart = APART[(page.report?.displayed ?? page.report)?.cause];
-  const stale = age !== null && age > (apart ? page.feeder.patience_shed_s : page.feeder.patience_s);
+  const stale = age !== null && age > ((apart && page.feeder.patience_shed_s) || page.feeder.patience_s);
   const state = !page.linked ? "lost" : stale ? "stale" : page.refused ? "refused" : waiting ? "connecting" : page.report.model_only ? (apart ? "apart" : "nodata") : "live";
   const shown = state === "live" && !page.alarmsLinked ? "alarms" : state;
   const words = {

@@ -13,15 +13,15 @@ A step, by module:
     verdict                         evidence of each meter, decision, explanations
 
 The residual of a meter is its squared reading less the model; fixed errors are states of the filter. A meter
-is named when `CONFIRM` searches in turn name it, when a search from an onset of this age names it alone, or
-when it repeats its readings beyond chance. Named meters are masked from the onset of the manipulation on, and
-released by their readings (`masking`). The busbar's meter is named by searches in turn; its phase then counts
-as not metered, until the meters agree with its reading again.
+is named when `CONFIRM` searches in turn name it, when one names it as the only fault with `CONFIRM` readings
+since the onset, or when it repeats its readings beyond chance. Named meters are masked from the onset of the
+manipulation on, and released by their readings (`masking`). The busbar's meter is named by searches in turn;
+its phase then counts as not metered, until the meters agree with its reading again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -34,7 +34,8 @@ from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.doubts import Unknown
 from gridsec.estimators.modal.estimate import Estimated, Reconstructed
 from gridsec.estimators.modal.record import Record
-from gridsec.estimators.modal.search import DOUBT
+from gridsec.estimators.modal.replay import Reading
+from gridsec.estimators.modal.search import DOUBT, Identification
 from gridsec.estimators.plant import Plant, nothing_new
 from gridsec.estimators.sequential import design as front_design
 from gridsec.estimators.sequential import init as front_init
@@ -83,7 +84,7 @@ from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.certificates import Certificate
 
 CONFIRM = 2
-"""Searches in turn that name a fault before it is named, and readings since the onset that name a sole meter.
+"""Searches in turn that name a fault before it is named. Least readings of a meter that one search names.
 
 One reading may be an outlier, and the first explanation of several faults a part of them.
 """
@@ -380,7 +381,7 @@ def _identified(
     after = replace(
         state, suspicion=suspicion, streak=streak, phases=phases, inverters=inverters, due=tick + wait
     )
-    sure = confirmed(named, streak, age)
+    sure = confirmed(suspicion.found, named, streak, state.core.history.readings[-age:])
     if any_of(sure):
         found = replace(suspicion.found, named=sure)
         masked, evidence = core.mask(kernel, state.core, replace(suspicion, found=found))
@@ -396,20 +397,26 @@ def _identified(
     return after, evidence
 
 
-def confirmed(named: Bools, streak: Ints, age: int) -> Bools:
+def confirmed(found: Identification, named: Bools, streak: Ints, since: Sequence[Reading]) -> Bools:
     """Meters that a search names finally, (p,).
 
     Parameters
     ----------
+    found
+        What it found.
     named : (p,)
-        Meters that it names.
+        Meters that it names newly.
     streak : (p,)
         Searches in turn that name each.
-    age
-        Readings since the suspected onset.
+    since
+        Ticks since the suspected onset.
     """
-    sole = age >= CONFIRM and np.count_nonzero(named) == 1
-    return named if sole else np.asarray(streak >= CONFIRM)
+    sole = np.flatnonzero(named)
+    if sole.size == 1 and np.count_nonzero(found.chosen[0]) == 1:
+        readings = sum(seen is None or bool(seen[sole[0]]) for _, _, seen, _ in since)
+        if readings >= CONFIRM:
+            return named
+    return np.asarray(streak >= CONFIRM)
 
 
 def _unsuspected(state: ModalState) -> ModalState:

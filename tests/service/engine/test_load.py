@@ -24,7 +24,7 @@ class Machine:
 
     def __init__(self, feeders: int) -> None:
         self.t = 0.0
-        self.control = LoadControl(lambda: self.t)
+        self.control = LoadControl(lambda: self.t, lambda _: False)
         self.offered: dict[str, int] = {}
         for k in range(feeders):
             self.control.feeders[f"f{k}"] = FeederLoad(1.0, 10)
