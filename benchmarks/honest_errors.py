@@ -24,9 +24,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from benchmarks._arguments import arguments
-from benchmarks.limits import head, row
+from benchmarks.limits import head, row, unlearned
 from feeders.model.site import Site, from_tables, load
-from feeders.registry import MODAL, SEQUENTIAL, design
+from feeders.model.site import names as library
+from feeders.registry import MODAL, SEQUENTIAL, DesignedEstimator
 from feeders.simulation.trial import Trial, TrialMeterErrors, frames
 from feeders.studies.calibrate.search import longer
 from gridsec.arrays import Floats
@@ -36,16 +37,6 @@ LONGER = (1.0, 1.1, 1.2)
 """Lengths of the lines over those of the files."""
 STEP_S, FRAMES, SETTLING = 5.0, 240, 60
 """Interval of the frames, s; their number; those before the first error that counts."""
-FEEDERS = (
-    "case33bw",
-    "cigre-lv",
-    "ieee-european-lv",
-    "kerber-dorfnetz",
-    "kerber-landnetz",
-    "kerber-vorstadtnetz",
-    "simbench-lv-rural1",
-    "simbench-lv-rural3",
-)
 
 
 @dataclass(slots=True)
@@ -63,24 +54,13 @@ class Errors:
         return float(np.sqrt(np.mean(self.squares))), float(np.sqrt(np.mean(self.ratios)))
 
 
-def errors(where: Site, factor: float, seed: int, into: dict[str, Errors]) -> None:
-    """Add the errors of one run."""
+def errors(where: Site, factor: float, seed: int, into: dict[str, tuple[DesignedEstimator, Errors]]) -> None:
+    """Add the errors of one run by each estimator."""
     lines = tuple(longer(line, factor) for line in where.tables.lines)
     truth = from_tables(replace(where.tables, lines=lines))
-    trial = Trial(
-        truth,
-        seed=seed,
-        duration_s=STEP_S * FRAMES,
-        step_s=STEP_S,
-        load_error=None,
-        meters=TrialMeterErrors.SITE,
-    )
-    stated = Trial(where, step_s=STEP_S, load_error=None, meters=TrialMeterErrors.SITE).stated.tables
-    played = list(frames(trial))
+    played = list(frames(replace(trial(truth), seed=seed)))
     volt = where.customer_volt
-    for name, out in into.items():
-        settings = replace(stated.meta.monitor, commission_s=0.0, estimator=name)
-        made = design(from_tables(replace(stated, meta=replace(stated.meta, monitor=settings))))
+    for made, out in into.values():
         state = made.init(played[0][0].t)
         for k, (frame, exact) in enumerate(played):
             state, estimate, verdict = made.step(state, frame)
@@ -91,6 +71,13 @@ def errors(where: Site, factor: float, seed: int, into: dict[str, Errors]) -> No
             out.ratios.append((apart / estimate.std) ** 2)
             out.not_clean += verdict.decision is not Decision.CLEAN
             out.named += int(verdict.suspects.sum())
+
+
+def trial(where: Site) -> Trial:
+    """Honest trial with the errors of a feeder's files."""
+    return Trial(
+        where, duration_s=STEP_S * FRAMES, step_s=STEP_S, load_error=None, meters=TrialMeterErrors.SITE
+    )
 
 
 def main(runs: int, names: tuple[str, ...]) -> None:
@@ -108,11 +95,13 @@ def main(runs: int, names: tuple[str, ...]) -> None:
     )
     for name in names:
         where = load(name)
+        stated = trial(where).stated
+        made = {estimator: unlearned(stated, estimator) for estimator in (SEQUENTIAL, MODAL)}
         for factor in LONGER:
-            found = {SEQUENTIAL: Errors(), MODAL: Errors()}
+            found = {estimator: (one, Errors()) for estimator, one in made.items()}
             for seed in range(runs):
                 errors(where, factor, seed, found)
-            now, new = found[SEQUENTIAL], found[MODAL]
+            now, new = found[SEQUENTIAL][1], found[MODAL][1]
             volts = [f"{1e3 * one.rms[0]:.0f}" for one in (now, new)]
             ratios = [f"{one.rms[1]:.2f}" for one in (now, new)]
             counts = [f"{one.not_clean}, {one.named}" for one in (now, new)]
@@ -120,5 +109,5 @@ def main(runs: int, names: tuple[str, ...]) -> None:
 
 
 if __name__ == "__main__":
-    asked = arguments(__doc__, runs=2, feeders=FEEDERS)
+    asked = arguments(__doc__, runs=2, feeders=tuple(library(balanced=False)))
     main(asked.runs, tuple(asked.feeders))

@@ -93,9 +93,14 @@ def site(feeder: str) -> Site:
 @lru_cache(maxsize=8)
 def watcher(feeder: str, meters: TrialMeterErrors, estimator: str = "sequential") -> DesignedEstimator:
     """A monitor of a feeder; `sequential` does not learn fixed errors."""
-    stated = Trial(site(feeder), meters=meters).stated
-    settings = replace(stated.tables.meta.monitor, commission_s=0.0, estimator=estimator)
-    return design(from_tables(replace(stated.tables, meta=replace(stated.tables.meta, monitor=settings))))
+    return unlearned(Trial(site(feeder), meters=meters).stated, estimator)
+
+
+def unlearned(stated: Site, estimator: str) -> DesignedEstimator:
+    """A monitor of a feeder without commissioning."""
+    meta = stated.tables.meta
+    settings = replace(meta.monitor, commission_s=0.0, estimator=estimator)
+    return design(from_tables(replace(stated.tables, meta=replace(meta, monitor=settings))))
 
 
 @lru_cache(maxsize=8)

@@ -340,10 +340,10 @@ class FeederMonitor:
 
     def stale(self, age_s: float) -> bool:
         """True if the latest tick, of this age, s, is late; those that display the overload are rare."""
-        told = self.latest
-        rare = told is not None and told.summary["cause"] is Cause.OVERLOAD
-        tick_s = self.aligner.rules.tick_s
-        return age_s > self.patience_s + (tick_s * (feeder_info.rare_ticks(tick_s) - 1) if rare else 0.0)
+        told, patience_s = self.latest, self.patience_s
+        if told is not None and told.summary["cause"] is Cause.OVERLOAD:
+            patience_s = feeder_info.patience_shed_s(patience_s, self.aligner.rules.tick_s)
+        return age_s > patience_s
 
     @cached_property
     def revision(self) -> str:

@@ -45,6 +45,11 @@ def rare_ticks(tick_s: float) -> int:
     return max(1, int(SHED_TICK_S / tick_s))
 
 
+def patience_shed_s(patience_s: float, tick_s: float) -> float:
+    """Return the age beyond which a state of a shed feeder is stale, s; `patience_s` is that of others."""
+    return patience_s + (rare_ticks(tick_s) - 1) * tick_s
+
+
 def status_of(now: Mapping[str, Any], patience_s: float | None, *, failed: bool = False) -> FeederStatus:
     """Return the status of a feeder: its displayed verdict, unless no value uses a present reading.
 
@@ -112,7 +117,7 @@ def detail(site: Site, patience_s: float) -> dict[str, Any]:
     fields = {
         **summary(site),
         "patience_s": patience_s,
-        "patience_shed_s": patience_s + (rare_ticks(meta.monitor.tick_s) - 1) * meta.monitor.tick_s,
+        "patience_shed_s": patience_shed_s(patience_s, meta.monitor.tick_s),
         "v_nominal_volt": meta.voltage_volt,
         "v_min_volt": meta.limits.v_min_pu * meta.voltage_volt,
         "v_max_volt": meta.limits.v_max_pu * meta.voltage_volt,
