@@ -34,7 +34,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from gridsec import errors
-from gridsec.arrays import Bools, Floats, submatrix
+from gridsec.arrays import Bools, Floats, Ints, submatrix
 from gridsec.estimators.sequential.posterior import Prior
 from gridsec.estimators.snapshot.collusion import ErrorSet, likely_sets, may_change
 from gridsec.estimators.snapshot.likelihood import (
@@ -58,6 +58,8 @@ _STARTS = 8
 """Customers of the most suspicious meters, at which a search with false powers may start."""
 _BEGUN = 2
 """Starts before the rest depends on an implausible best hypothesis: many accused, or a bad fit."""
+_PAIRS, _TOGETHER = 32, 4
+"""Pairs of customers that are extended to triples; pairs and triples from which a search starts."""
 _MANY = 0.25
 """Part of the meters that counts as many."""
 
@@ -147,6 +149,12 @@ def _explanations(
     if len(known) == 1:
         return [start]
     if false and not _plausible(problem, known):
+        for customers in _together(problem, start):
+            at = start
+            for c in customers:
+                at = _doubted(problem, at, c)
+            _descend(problem, at, known, false)
+    if false and not _plausible(problem, known):
         # False powers may mislead: first the meters with all powers true, then the powers.
         apart: dict[bytes, SnapshotHypothesis] = {}
         _descend(problem, _descend(problem, start, apart, False), known, false)
@@ -192,6 +200,31 @@ def _doubted(problem: LikelihoodProblem, at: SnapshotHypothesis, c: int) -> Snap
     problem.doubt_powers(after, c)
     problem.linearise(after)
     return after
+
+
+def _together(problem: LikelihoodProblem, start: SnapshotHypothesis) -> list[tuple[int, ...]]:
+    """Likeliest pairs and triples of customers with manipulated meters and false powers.
+
+    Two customers that coordinate their meters and powers hide each other: the powers of each alone explain
+    little. J of all pairs follows from products of the columns ``[A e_c, B_c]``. The best pairs are extended
+    by each other customer.
+    """
+    p = problem.size
+    rows = np.concatenate([np.vstack([problem.error(c), problem.columns(c)]) for c in range(p)])
+    white = rows @ problem.W.T
+    G, h = white @ white.T + np.eye(3 * p), white @ (problem.W @ start.m)
+
+    def best(sets: Ints) -> Ints:
+        at = (3 * sets[:, :, None] + np.arange(3)).reshape(len(sets), -1)
+        half = np.linalg.cholesky(G[at[:, :, None], at[:, None, :]])
+        v = np.linalg.solve(half, h[at][:, :, None])[:, :, 0]
+        cost = 2.0 * np.log(np.einsum("kii->ki", half)).sum(axis=1) - (v * v).sum(axis=1)
+        return sets[np.argsort(cost, kind="stable")[:_PAIRS]]
+
+    pairs = best(np.stack(np.triu_indices(p, 1), axis=1)) if p > 1 else np.zeros((0, 2), np.intp)
+    more = [np.append(pair, c) for pair in pairs for c in range(p) if c not in pair]
+    triples = best(np.unique(np.sort(np.stack(more), axis=1), axis=0)) if more else np.zeros((0, 3), np.intp)
+    return [tuple(each) for some in (pairs, triples) for each in some[:_TOGETHER].tolist()]
 
 
 def _descend(

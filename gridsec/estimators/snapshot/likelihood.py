@@ -249,7 +249,7 @@ class LikelihoodProblem:
     def _against(self, at: SnapshotHypothesis, c: int) -> tuple[list[float], list[float], list[float]]:
         """``B^T Q B``, its three numbers, ``e^T Q B`` of the customer's own meter, and ``B^T g``."""
         if c not in self.directions:
-            B = self._columns(c)
+            B = self.columns(c)
             white = np.array([self.W @ u for u in B])
             self.directions[c] = B, white @ white.T, white @ self.W[:, c]
         B, M, own = self.directions[c]
@@ -259,7 +259,13 @@ class LikelihoodProblem:
         (a, b), (_, d) = M.tolist()
         return [a, b, d], own.tolist(), (B @ at.g).tolist()
 
-    def _columns(self, c: int) -> Floats:
+    def error(self, c: int) -> Floats:
+        """Effect of a manipulated meter times A, (p,)."""
+        out = np.zeros(self.size)
+        out[c] = self.prior.size
+        return out
+
+    def columns(self, c: int) -> Floats:
         """B of a customer, a row for each power, (2, p)."""
         if self.false is None:
             raise errors.InputInvalid([errors.Problem("missing", "there are no false powers")])
@@ -285,7 +291,7 @@ class LikelihoodProblem:
 
     def doubt_powers(self, at: SnapshotHypothesis, c: int, sign: float = 1.0) -> None:
         """Doubt a customer's powers, or with `sign` -1 trust them again."""
-        for u in self.directions[c][0] if c in self.directions else self._columns(c):
+        for u in self.directions[c][0] if c in self.directions else self.columns(c):
             q = at.times(u)
             at.change(q, sign, float(u @ q), float(u @ at.g))
         at.powers[c] = sign > 0

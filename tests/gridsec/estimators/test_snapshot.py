@@ -13,7 +13,13 @@ from gridsec.arrays import Bools, Floats
 from gridsec.errors import InputInvalid
 from gridsec.estimators.sequential.posterior import Prior
 from gridsec.estimators.snapshot.collusion import _SamePowers
-from gridsec.estimators.snapshot.identification import ErrorPrior, FalsePowers, SnapshotExplanation, identify
+from gridsec.estimators.snapshot.identification import (
+    ErrorPrior,
+    FalsePowers,
+    SnapshotExplanation,
+    _together,
+    identify,
+)
 from gridsec.estimators.snapshot.likelihood import LikelihoodProblem, SnapshotHypothesis
 from tests.codes import refused
 
@@ -202,6 +208,37 @@ def test_false_powers_are_found_with_their_meter() -> None:
         assert tuple(np.flatnonzero(found[0].powers).tolist()) == best[1]
         exact += best == ((c,), (c,))
     assert exact >= 18
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_pairs_and_triples_with_false_powers_are_ranked_as_dense_algebra_ranks_them(seed: int) -> None:
+    """Two customers with false meters and powers; all pairs and all triples."""
+    rng = np.random.default_rng(seed)
+    prior, noise, false = street(rng)
+    customers = np.sort(rng.choice(P, 2, replace=False))
+    m = rng.multivariate_normal(np.zeros(P), prior.between + np.diag(noise))
+    m -= false.R[:, customers] @ rng.uniform(0.3, 0.7, 2)
+    m[customers] += rng.uniform(0.05, 0.2, 2)
+    K = prior.between + np.diag(noise)
+    W = np.linalg.inv(np.linalg.cholesky(K))
+    start = SnapshotHypothesis.without_accusations(m, W)
+    found = _together(LikelihoodProblem(APART, start, false, None), start)
+    for size in (2, 3):
+        costs = {each: independent(K, false, m, each) for each in combinations(range(P), size)}
+        ranked = sorted(costs, key=lambda each: costs[each])
+        mine = [tuple(sorted(each)) for each in found if len(each) == size]
+        assert mine == ranked[: len(mine)]
+    assert len(found) == 8
+
+
+def independent(K: Floats, false: FalsePowers, m: Floats, customers: tuple[int, ...]) -> float:
+    """Minus twice the log likelihood with independent errors of the customers' meters and powers."""
+    both = K.copy()
+    for c in customers:
+        B = np.column_stack([false.R[:, c] * false.p[c], false.X[:, c] * false.q[c]])
+        both += B @ B.T
+        both[c, c] += LIES.size**2
+    return float(np.linalg.slogdet(both)[1] + m @ np.linalg.solve(both, m))
 
 
 def test_false_powers_are_found_where_no_meter_alone_is_suspicious_enough() -> None:
