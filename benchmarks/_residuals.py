@@ -61,7 +61,6 @@ def model_of(
     classes: Floats | float = 0.005,
     busbar: float = 1e-3,
     flicker: float = 2e-4,
-    lasting: float = 0.0,
     time_s: float = 600.0,
     fixed_s: float = np.inf,
 ) -> ResidualModel:
@@ -77,7 +76,7 @@ def model_of(
         White standard deviation and accuracy class of the meters, one or (p,).
     busbar, flicker
         Standard deviations of the fixed and of the white error of the busbar's meter.
-    lasting, time_s, fixed_s
+    time_s, fixed_s
         As in `ResidualModel`.
     """
     at, n = feeder.bus, len(feeder.buses)
@@ -91,7 +90,6 @@ def model_of(
         busbar=4.0 * busbar**2,
         flicker=4.0 * flicker**2,
         busbar_of=np.ones((n, 1)),
-        lasting=lasting,
         time_s=time_s,
         fixed_s=fixed_s,
     )
@@ -140,7 +138,7 @@ class Source:
         self.random, self.size = random, at.size
         self.rho, self.rho_b = exp(-step_s / model.time_s), exp(-step_s / model.fixed_s)
         self.noise = root(model.noise(at))
-        self.loads = root((1.0 - model.lasting) * model.loads(at))
+        self.loads = root(model.loads(at))
         self.ages = root(model.aging(at))
         # What has aged since the start is added to errors of the first tick: exact for times far below T_b.
         self.w, self.b = self.loads @ self._white(), root(model.static(at)) @ self._white()
@@ -184,7 +182,7 @@ class Dense:
         G = np.zeros((p, 0)) if faults is None else faults[at]
         self.model, self.p, self.k = model, p, G.shape[1]
         self.prior = np.zeros((3 * p + self.k, 3 * p + self.k))
-        self.prior[:p, :p] = (1.0 - model.lasting) * model.loads(at)
+        self.prior[:p, :p] = model.loads(at)
         self.prior[p : 2 * p, p : 2 * p] = model.aging(at)
         self.prior[2 * p : 3 * p, 2 * p : 3 * p] = model.static(at) - model.aging(at)
         self.prior[3 * p :, 3 * p :] = std**2 * np.eye(self.k)
@@ -285,7 +283,7 @@ class KnownStep:
     def __init__(self, model: ResidualModel, meter: int, size: float, onsets: int) -> None:
         at = np.arange(model.meters.size)
         self.p, self.model, self.meter, self.size, self.count = at.size, model, meter, size, 0
-        self.w, self.D = (1.0 - model.lasting) * model.loads(at), model.noise(at)
+        self.w, self.D = model.loads(at), model.noise(at)
         self.P = np.zeros((2 * self.p, 2 * self.p))
         self.P[: self.p, : self.p], self.P[self.p :, self.p :] = self.w, model.static(at)
         self.x, self.X = np.zeros(2 * self.p), np.zeros((2 * self.p, onsets))

@@ -23,7 +23,17 @@ from scipy.linalg import cholesky, solve_triangular
 
 from gridsec.arrays import Bools, Floats, Ints, any_of, indices
 from gridsec.errors import InputInvalid, Problem
-from gridsec.estimators.modal import detector, full, masking, mirrors, replay, rivals, signatures, static
+from gridsec.estimators.modal import (
+    collusion,
+    detector,
+    full,
+    masking,
+    mirrors,
+    replay,
+    rivals,
+    signatures,
+    static,
+)
 from gridsec.estimators.modal import estimate as estimates
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.costs import SearchProblem, cost
@@ -454,7 +464,7 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     The search is made at the onset that suits faults of all members best, under the model of the loads and
     its rivals. The costs of what it finds are then compared at the other onsets, and where another one is
     cheaper, the search is made there. Where readings are missing, only the pinned onsets are searched, with
-    exact scores.
+    exact scores. Meters that colluding others may replace are not named.
 
     Parameters
     ----------
@@ -473,7 +483,8 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     best = int(np.argmin(costs))
     if best:
         found = _searched(core, state, rows[best])
-    return Suspicion(rows[best], mirrors.reflected(found, core.near))
+    found = collusion.weighed(mirrors.reflected(found, core.near), state.masked.meters, core.near.most)
+    return Suspicion(rows[best], found)
 
 
 def _unknown(state: CoreState) -> Floats | None:

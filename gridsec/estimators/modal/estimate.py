@@ -4,7 +4,7 @@ The squared voltage at place x exceeds the front end's model by ``w_x + b_x + e_
 come and go, what lasts (loads, and the class of the busbar's meter), and the flicker of the busbar's meter.
 Given the states w, b and the white errors e of the members, in their modes,
 
-    E w_x = S_xT U lam^-1 w        E b_x = C_x B^-1 b,  C = c S + s0^2 H H'        E e_x = phi H_x H' U e
+    E w_x = S_xT U lam^-1 w        E b_x = C_x B^-1 b,  C = s0^2 H H'        E e_x = phi H_x H' U e
 
 and what is left is independent of all readings: the loads have one correlation time, so that w_x beyond
 S_xT is another AR(1) process. With ``e = z - w - b``, z being the readings in the modes, the estimate is
@@ -58,10 +58,10 @@ class Estimator:
         Regression of the error of the model at each place on w, b and e.
     of_modes : (n, t)
         Covariance h of the loads at each place with the modes.
-    by_w, by_b : (t,)
-        ``of_w = h diag(by_w)``; ``of_b`` is ``h diag(by_b)`` but for a few directions.
+    by_w : (t,)
+        ``of_w = h diag(by_w)``.
     left, right : (n, k), (k, 2 t)
-        Factors of the rest of ``(of_b, of_e)``: meters of their own and the busbar's phases.
+        Factors of ``(of_b, of_e)``, of a few directions: the busbar's phases.
     rest : (n,)
         Variance that no reading takes away, squared pu^2.
     rest_w : (n,)
@@ -73,7 +73,6 @@ class Estimator:
     of_e: Floats = field(repr=False)
     of_modes: Floats = field(repr=False)
     by_w: Floats = field(repr=False)
-    by_b: Floats = field(repr=False)
     left: Floats = field(repr=False)
     right: Floats = field(repr=False)
     rest: Floats
@@ -115,23 +114,21 @@ def estimator(modes: Modes) -> Estimator:
     h = S @ modes.U
     by_w = np.where(known, 1.0 / np.where(known, modes.loads, 1.0), 0.0)
     ratio = h * by_w
-    C = model.lasting * S + model.busbar * (model.busbar_of @ H.T)
+    C = model.busbar * (model.busbar_of @ H.T)
     by_b = np.linalg.solve(model.static(at), C.T).T if C.any() else np.zeros_like(C)
     by_e = model.flicker * (model.busbar_of @ (H.T @ modes.U))
     phases = (model.busbar_of**2).sum(axis=1)
-    rest_w = (1.0 - model.lasting) * (model.variance - (ratio * h).sum(axis=1))
-    rest = rest_w + model.lasting * model.variance + model.busbar * phases - (by_b * C).sum(axis=1)
+    rest_w = model.variance - (ratio * h).sum(axis=1)
+    rest = rest_w + model.busbar * phases - (by_b * C).sum(axis=1)
     rest += model.flicker * phases - (by_e * by_e).sum(axis=1)
-    of_b, lasts = by_b @ modes.back, modes.lasting > 0.0
-    share = np.where(lasts, model.lasting / np.where(lasts, modes.lasting, 1.0), 0.0)
-    left, right = _factors(np.hstack([of_b - h * share, by_e]))
+    of_b = by_b @ modes.back
+    left, right = _factors(np.hstack([of_b, by_e]))
     return Estimator(
         of_w=ratio,
         of_b=of_b,
         of_e=by_e,
         of_modes=np.ascontiguousarray(h),
         by_w=by_w,
-        by_b=share,
         left=left,
         right=right,
         rest=np.maximum(rest, 0.0),
@@ -182,9 +179,7 @@ def honest(
 
 def _mean(made: Estimator, w: Floats, b: Floats, e: Floats) -> Floats:
     """Regression of all places on w, b and e, (n,)."""
-    of_modes = made.by_w * w
-    of_modes += made.by_b * b
-    out = made.of_modes @ of_modes
+    out = made.of_modes @ (made.by_w * w)
     out += made.left @ (made.right @ np.concatenate([b, e]))
     return out
 
@@ -278,6 +273,33 @@ def corrected(before: Sequence[Estimated], T: Sequence[Floats], found: Identific
         return np.asarray(np.maximum(weight @ (np.stack(each) + apart), POSSIBLE * possible))
 
     return Estimated(mean, spread)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Spread:
+    """Variance of the voltages at all places, (n,), evaluated where asked for.
+
+    Attributes
+    ----------
+    errors
+        Errors of the model.
+    more : (n,)
+        Variance of unknown directions, squared pu^2.
+    places, least
+        The busbar, and its least variance, squared pu^2; None for no limit.
+    """
+
+    errors: Estimated
+    more: Floats | float = 0.0
+    places: slice | None = None
+    least: Floats | float = 0.0
+
+    def __call__(self) -> Floats:
+        """The variance, (n,), squared pu^2."""
+        out = self.errors.variance + self.more
+        if self.places is not None:
+            out[self.places] = np.maximum(out[self.places], self.least)
+        return out
 
 
 def _of_amounts(T: Floats, problem: SearchProblem, chosen: Bools) -> Floats:

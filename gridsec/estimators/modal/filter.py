@@ -8,7 +8,7 @@ With ``z = U' m`` of `gridsec.estimators.modal.model`, each mode has the states 
               (w, b) += k nu,  P -= v k k'
 
 where q and s are the variances of w and b, ``rho = exp(-h / T)``, ``rho_b = exp(-h / T_b)`` for an interval
-of h seconds. The cost is O(t) and the product ``U' m``. The filter is exact for ``B = kappa D + c S``, and
+of h seconds. The cost is O(t) and the product ``U' m``. The filter is exact for ``B = kappa D``, and
 with `gridsec.estimators.modal.static` for every B.
 
 **Missing readings** couple the modes: `gridsec.estimators.modal.full` follows the exact filter then. The

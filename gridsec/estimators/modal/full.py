@@ -4,7 +4,7 @@ With complete readings the filter of `gridsec.estimators.modal.filter` with
 `gridsec.estimators.modal.static` is exact and diagonal. A missing reading couples the modes. From then on
 the state x = (w, b) of all members has a full covariance P, in the coordinates of the meters:
 
-    predict   x <- (rho w, rho_b b),  P <- R P R + blockdiag((1 - rho^2) (1 - c) S, (1 - rho_b^2) B)
+    predict   x <- (rho w, rho_b b),  P <- R P R + blockdiag((1 - rho^2) S, (1 - rho_b^2) B)
     update    V = (H P H' + D)_nn,  sigma = V^-1 (m - H x)_n,  x += P H_n' sigma,  P -= P H_n' V^-1 H_n P
 
 with the readings n of the tick and ``H = [1, 1]``. The start is the posterior of the modal filter:

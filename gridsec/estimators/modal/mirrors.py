@@ -23,16 +23,16 @@ doubt all others of its phase.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Ints, any_of, submatrix
-from gridsec.estimators.modal.costs import BELIEVED, SearchProblem, informed
+from gridsec.estimators.modal.costs import SearchProblem, informed
 from gridsec.estimators.modal.laterals import clusters, coded
 from gridsec.estimators.modal.model import Modes
-from gridsec.estimators.modal.search import ALIKE, DOUBT, Identification
+from gridsec.estimators.modal.search import ALIKE, Identification, costs_of, identified
 
 REFLECTED = 0.01
 """Weight from which on an explanation has mirror images, 1: that of reported explanations."""
@@ -70,33 +70,16 @@ def neighbourhoods(modes: Modes, most: int) -> Neighbourhoods:
 
 def reflected(found: Identification, near: Neighbourhoods) -> Identification:
     """Explanations with the mirror images of those that weigh at least `REFLECTED`."""
-    p = near.phases.shape[0]
-    cost = {
-        (model, chosen.tobytes()): -2.0 * np.log(weight)
-        for model, chosen, weight in zip(found.model.tolist(), found.chosen, found.weight, strict=True)
-    }
+    found_by = costs_of(found)
     for k in np.flatnonzero(found.weight >= REFLECTED).tolist():
-        model = int(found.model[k])
-        own = cost[model, found.chosen[k].tobytes()]
-        for image, more in _images(found.problems[model], found.chosen[k], near):
-            key = model, image.tobytes()
+        cost = found_by[int(found.model[k])]
+        own = cost[found.chosen[k].tobytes()]
+        for image, more in _images(found.problems[int(found.model[k])], found.chosen[k], near):
+            key = image.tobytes()
             cost[key] = min(own + more, cost.get(key, np.inf))
-    if len(cost) == len(found.weight):
+    if sum(map(len, found_by)) == len(found.weight):
         return found
-    ordered = sorted((value, *key) for key, value in cost.items())
-    value = np.array([one for one, _, _ in ordered])
-    weight = np.exp(-0.5 * (value - value[0]))
-    weight /= weight.sum()
-    kept = weight >= BELIEVED
-    chosen = np.stack([np.frombuffer(key, dtype=np.bool_) for _, _, key in ordered])[kept]
-    weight = weight[kept] / weight[kept].sum()
-    return replace(
-        found,
-        chosen=chosen,
-        model=np.array([model for _, model, _ in ordered])[kept],
-        weight=weight,
-        named=np.asarray(weight @ ~chosen[:, :p] < DOUBT),
-    )
+    return identified(found.problems, found_by)
 
 
 def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iterator[tuple[Bools, float]]:

@@ -4,21 +4,21 @@ The residual of a meter is its squared reading minus the loss-corrected model at
 
     m_t = w_t + b_t + e_t + f_t                                            (p,), squared pu
 
-    w   errors of the loads: vector AR(1), covariance (1 - c) S, factor exp(-h / T)
-    b   errors that last: covariance B = diag(fixed) + s0^2 H H' + c S
+    w   errors of the loads: vector AR(1), covariance S, factor exp(-h / T)
+    b   errors that last: covariance B = diag(fixed) + s0^2 H H'
     e   white: D = diag(white) + phi H H'
     f   faults
 
-``S`` is the covariance of the voltages at the meters due to wrong powers, ``c`` the share of it that lasts,
-``H`` the incidence of meters and busbar phases, ``s0`` the class of the busbar's meter, ``phi`` its jitter.
+``S`` is the covariance of the voltages at the meters due to wrong powers, ``H`` the incidence of meters and
+busbar phases, ``s0`` the class of the busbar's meter, ``phi`` its jitter.
 
 **Modes.** ``U' D U = I`` and ``U' S U = diag(lam)``. In the coordinates ``z = U' m`` the white part is the
-identity, w is diagonal, and b is diagonal if ``B - c S`` is proportional to D. In general
+identity, w is diagonal, and b is diagonal if B is proportional to D. In general
 
-    B = kappa D + c S + G diag(sign) G'
+    B = kappa D + G diag(sign) G'
 
 with directions ``G``: one for each phase of the busbar, with ``|s0^2 - kappa phi|``, and one for each meter
-with a ratio fixed / white above kappa, the least of these ratios. The filter runs with ``kappa D + c S``,
+with a ratio fixed / white above kappa, the least of these ratios. The filter runs with ``kappa D``,
 which is diagonal, and `gridsec.estimators.modal.static` adds ``G theta``, ``theta ~ N(0, diag(sign))``,
 exactly. The first part ages as an AR(1) process with the factor exp(-h / T_b); theta is constant.
 
@@ -42,8 +42,8 @@ from gridsec.estimators.sequential.posterior import voltage_prior
 
 FIXED_S = YEAR_S
 """Time constant of fixed errors, s. Meters age over years; with a day, lies of 0.5 %/h stay hidden."""
-MOST_LASTING = 0.9
-"""Largest share of the loads' errors that lasts, 1. Errors of registers are parts of loads, which change."""
+REPORTED_S = 3600.0
+"""Correlation time of the errors of reported powers, s: parts of loads, which change within an hour."""
 SAME = 1e-9
 """Relative difference below which two ratios or two eigenvalues are equal, 1: rounding."""
 
@@ -67,8 +67,6 @@ class ResidualModel:
         Variance of the fixed and of the white error of the busbar's meter, squared pu^2.
     busbar_of : (n, b)
         1 where a place hangs on a phase of the busbar, else 0.
-    lasting
-        Share of S that lasts, 0 to 1.
     time_s, fixed_s
         Time constants of w and of the part of b that ages, s; infinite for constants.
 
@@ -86,7 +84,6 @@ class ResidualModel:
     busbar: float
     flicker: float
     busbar_of: Floats
-    lasting: float
     time_s: float
     fixed_s: float = FIXED_S
 
@@ -108,7 +105,6 @@ class ResidualModel:
             ("fixed", bool((self.fixed >= 0.0).all()), "at least 0"),
             ("busbar", self.busbar >= 0.0, "at least 0"),
             ("flicker", self.flicker >= 0.0, "at least 0"),
-            ("lasting", 0.0 <= self.lasting <= 1.0, "from 0 to 1"),
             ("time_s", self.time_s > 0.0, "positive"),
             ("fixed_s", self.fixed_s > 0.0, "positive"),
         )
@@ -149,14 +145,14 @@ class ResidualModel:
         return np.diag(self.white[at]) + self.flicker * (H @ H.T)
 
     def aging(self, at: Ints) -> Floats:
-        """Covariance ``kappa D + c S`` of the part of B that ages, (k, k).
+        """Covariance ``kappa D`` of the part of B that ages, (k, k).
 
         Parameters
         ----------
         at : (k,)
             The meters.
         """
-        return self.kappa(at) * self.noise(at) + self.lasting * self.loads(at)
+        return self.kappa(at) * self.noise(at)
 
     def kappa(self, at: Ints) -> float:
         """Least ratio of fixed to white variance.
@@ -177,7 +173,7 @@ class ResidualModel:
             The meters.
         """
         H = self.phases(at)
-        return np.diag(self.fixed[at]) + self.busbar * (H @ H.T) + self.lasting * self.loads(at)
+        return np.diag(self.fixed[at]) + self.busbar * (H @ H.T)
 
 
 def residual_model(design: SequentialDesign) -> ResidualModel:
@@ -202,8 +198,7 @@ def residual_model(design: SequentialDesign) -> ResidualModel:
         busbar=design.busbar**2,
         flicker=design.busbar_noise,
         busbar_of=np.equal.outer(places % phases, np.arange(phases)).astype(np.float64),
-        lasting=min(float(doubt.lasting), MOST_LASTING),
-        time_s=doubt.time_s,
+        time_s=max(doubt.time_s, REPORTED_S) if doubt.lasting > 0.0 else doubt.time_s,
     )
 
 
@@ -222,7 +217,7 @@ class Modes:
     loads : (t,)
         Eigenvalues lam of S, in units of the white variance.
     varying, lasting : (t,)
-        Variance of w and of the filter's part of b in each mode: ``(1 - c) lam`` and ``kappa + c lam``.
+        Variance of w and of the filter's part of b in each mode: lam and kappa.
     directions : (t, r)
         ``U' G``; those of the busbar come first.
     sign : (r,)
@@ -262,8 +257,8 @@ class Modes:
 
     @cached_property
     def jumps(self) -> Floats:
-        """Covariance ``(1 - c) S`` of a change of the loads at the members, (t, t)."""
-        return (1.0 - self.model.lasting) * self.model.loads(self.at)
+        """Covariance S of a change of the loads at the members, (t, t)."""
+        return self.model.loads(self.at)
 
     @cached_property
     def covariance_b(self) -> Floats:
@@ -335,8 +330,8 @@ def modes(model: ResidualModel, at: Ints | None = None) -> Modes:
         U=U,
         back=D @ U,
         loads=lam,
-        varying=(1.0 - model.lasting) * lam,
-        lasting=kappa + model.lasting * lam,
+        varying=lam,
+        lasting=np.full(lam.size, kappa),
         directions=U.T @ G,
         sign=sign,
         busbar=busbar,

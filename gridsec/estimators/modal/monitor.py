@@ -12,11 +12,13 @@ A step, by module:
     core                            filter, detector, search, masking
     verdict                         evidence of each meter, decision, explanations
 
-The residual of a meter is its squared reading less the model; fixed errors are states of the filter. A meter
-is named when `CONFIRM` searches in turn name it, when one names it as the only fault with `CONFIRM` readings
-since the onset, or when it repeats its readings beyond chance. Named meters are masked from the onset of the
-manipulation on, and released by their readings (`masking`). The busbar's meter is named by searches in turn;
-its phase then counts as not metered, until the meters agree with its reading again.
+The residual of a meter is its squared reading less the model; fixed errors are states of the filter.
+Registers err in proportion to v2: with b at 1 pu, ``b (v2 - 1)`` by the mean of b before the tick is no part
+of the residual. A meter is named when a search names it and `CONFIRM` searches in turn have it in their
+likeliest explanations, when one search names it as the only fault with `CONFIRM` readings since the onset,
+or when it repeats its readings beyond chance. Named meters are masked from the onset on, and released by
+their readings (`masking`). The busbar's meter is named by searches in turn; its phase then counts as not
+metered, until the meters agree with its reading again.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ from gridsec.estimators.modal import core, doubts, full, masking, record, verdic
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.doubts import Unknown
-from gridsec.estimators.modal.estimate import Estimated, Reconstructed
+from gridsec.estimators.modal.estimate import Reconstructed, Spread
 from gridsec.estimators.modal.record import Record
 from gridsec.estimators.modal.replay import Reading
 from gridsec.estimators.modal.search import DOUBT, Identification
@@ -84,7 +86,7 @@ from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.certificates import Certificate
 
 CONFIRM = 2
-"""Searches in turn that name a fault before it is named. Least readings of a meter that one search names.
+"""Searches in turn that accuse a fault before it is named. Least readings of a meter that one search names.
 
 One reading may be an outlier, and the first explanation of several faults a part of them.
 """
@@ -108,13 +110,15 @@ class ModalDesign:
         Design of the front end.
     core
         The statistical core.
-    own : (p, p)
-        Regression of the meters' own fixed errors on all errors that last: ``diag(fixed) B^-1``.
+    own, own_of_modes : (p, p), (p, t)
+        Regression of the meters' own fixed errors on all errors that last, ``diag(fixed) B^-1``, and on their
+        modes.
     """
 
     front: SequentialDesign
     core: Core
     own: Floats = field(repr=False)
+    own_of_modes: Floats = field(repr=False)
 
     @property
     def plant(self) -> Plant:
@@ -159,7 +163,7 @@ def design(
     front = front_design(plant, doubt=doubt, step_s=step_s, options=options, max_attacked=max_attacked)
     kernel = core.design(front, most)
     own = np.asarray(np.linalg.solve(kernel.modes.covariance_b, np.diag(kernel.model.fixed)).T, np.float64)
-    return ModalDesign(front, kernel, own)
+    return ModalDesign(front, kernel, own, own @ kernel.modes.back)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,7 +179,7 @@ class ModalState:
     suspicion
         Explanations of the last search, while they hold.
     streak : (p,)
-        Searches in turn that name each meter.
+        Searches in turn with each meter in the likeliest explanation.
     phases : (b,)
         Searches in turn that name each phase of the busbar with a meter.
     inverters : (m,)
@@ -254,7 +258,8 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     uncertainty = update_uncertainty(
         front, given.uncertainty, frame, measured.available, measured.busbar_metered
     )
-    given, measured, predicted = _driven(design, state, given, measured, uncertainty)
+    own = own_errors(design, state.core)
+    given, measured, predicted = _driven(design, state, given, measured, uncertainty, own)
     v2 = predicted.v2_bus[front.prior.meters]
     skew = given.clock_skew
     if skew is not None or frame.clock_offset is not None:
@@ -270,7 +275,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
         v0_squared=measured.v0_squared,
     )
     open_ = doubts.unknown(front, measured, uncertainty, predicted, skew)
-    seen, whole, m = measured.available, all_of(measured.available), measured.y - v2
+    seen, whole, m = measured.available, all_of(measured.available), measured.y - _expected(v2, own)
     if not whole:
         m = np.where(seen, m, 0.0)
     kernel = _begun_anew(design, state, frame.t) if open_ is None and whole else state.core
@@ -292,12 +297,18 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     return _answered(design, after, tick)
 
 
-def _driven(
+def _expected(v2: Floats, own: Floats) -> Floats:
+    """Readings by the model without the error of each register at 1 pu, (p,), squared pu."""
+    return v2 + own * (v2 - 1.0)
+
+
+def _driven(  # noqa: PLR0917  # the state, and one frame
     design: ModalDesign,
     state: ModalState,
     given: SequentialState,
     measured: Measurements,
     uncertainty: FrameUncertainty,
+    own: Floats,
 ) -> tuple[SequentialState, Measurements, Prediction]:
     """Front end, measurements and prediction without inverters driven by a reading that jumps.
 
@@ -308,7 +319,7 @@ def _driven(
     predicted = predict(front, given, measured, uncertainty.sizes)
     if kernel.update is None or not front.meter_of.size or given.x is None:
         return given, measured, predicted
-    m = measured.y - predicted.v2_bus[front.prior.meters]
+    m = measured.y - _expected(predicted.v2_bus[front.prior.meters], own)
     # The variance is at least that of the white errors.
     far = np.abs(verdict.offsets(design.core, kernel, m)) > JUMP * design.core.modes.noise_std
     if not any_of(far):
@@ -371,17 +382,19 @@ def _identified(
         return replace(state, suspicion=suspicion), evidence
     suspicion = core.identify(kernel, state.core, evidence)
     named = suspicion.found.named & ~state.core.masked.meters
-    streak = np.where(named, state.streak + 1, 0)
+    streak = np.where(suspicion.found.chosen[0, : named.size], state.streak + 1, 0)
     phases = np.where(verdict.certain_phases(kernel, suspicion), state.phases + 1, 0)
     certain = verdict.certain_inverters(design.front, kernel, suspicion, uses_q)
     inverters = np.where(certain, state.inverters + 1, 0)
     age = int(state.core.detector.onsets.age[suspicion.row])
     # A fault with a first naming is searched again at the next tick.
-    wait = 1 if any((each == 1).any() for each in (streak, phases, inverters)) else max(1, age // LOOKS)
+    first = any((each == 1).any() for each in (streak[named], phases, inverters))
+    wait = 1 if first else max(1, age // LOOKS)
     after = replace(
         state, suspicion=suspicion, streak=streak, phases=phases, inverters=inverters, due=tick + wait
     )
-    sure = confirmed(suspicion.found, named, streak, state.core.history.readings[-age:])
+    since = () if any_of(state.core.masked.meters) else state.core.history.readings[-age:]
+    sure = confirmed(suspicion.found, named, streak, since)
     if any_of(sure):
         found = replace(suspicion.found, named=sure)
         masked, evidence = core.mask(kernel, state.core, replace(suspicion, found=found))
@@ -407,16 +420,16 @@ def confirmed(found: Identification, named: Bools, streak: Ints, since: Sequence
     named : (p,)
         Meters that it names newly.
     streak : (p,)
-        Searches in turn that name each.
+        Searches in turn with each in the likeliest explanation.
     since
-        Ticks since the suspected onset.
+        Ticks since the suspected onset; none where meters are masked, and may collude with others.
     """
     sole = np.flatnonzero(named)
     if sole.size == 1 and np.count_nonzero(found.chosen[0]) == 1:
         readings = sum(seen is None or bool(seen[sole[0]]) for _, _, seen, _ in since)
         if readings >= CONFIRM:
             return named
-    return np.asarray(streak >= CONFIRM)
+    return np.asarray(named & (streak >= CONFIRM))
 
 
 def _unsuspected(state: ModalState) -> ModalState:
@@ -601,7 +614,7 @@ def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Esti
     front, kernel, measured = design.front, design.core, tick.measured
     plant, now = front.plant, state.front
     errors = core.estimate(kernel, state.core, state.suspicion)
-    mean, spread = errors.mean, _Spread(errors)
+    mean, spread = errors.mean, Spread(errors)
     whole = state.core.filter.full
     if tick.unknown is not None and whole is not None:
         u, read = tick.m - whole.mean[0] - whole.mean[1], whole.seen
@@ -611,7 +624,7 @@ def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Esti
             u = u - (mean - plain.mean)[front.prior.meters]
             read = read & ~verdict.accused(kernel, state.suspicion)
         more = doubts.estimated(kernel.modes, tick.unknown, u, read)
-        mean, spread = mean + more[0], _Spread(errors, more[1])
+        mean, spread = mean + more[0], Spread(errors, more[1])
     v2_bus, first = tick.predicted.v2_bus + mean, plant.feeder.busbar_places()
     metered = all_of(np.asarray(measured.busbar_metered))
     v2_bus[first] = (
@@ -638,22 +651,6 @@ def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Esti
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Spread:
-    """Variance of the voltages at all places, (n,), evaluated where asked for."""
-
-    errors: Estimated
-    more: Floats | float = 0.0  # of unknown directions
-    places: slice | None = None  # busbar
-    least: Floats | float = 0.0  # at `places`
-
-    def __call__(self) -> Floats:
-        out = self.errors.variance + self.more
-        if self.places is not None:
-            out[self.places] = np.maximum(out[self.places], self.least)
-        return out
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Checked:
     """Meters with a known customer's power, (p,), evaluated with the bound."""
 
@@ -665,18 +662,19 @@ class _Checked:
 
 
 def own_errors(design: ModalDesign, state: CoreState) -> Floats:
-    """Posterior means of the meters' own fixed errors, (p,), squared pu.
+    """Posterior means of the meters' own fixed errors, (p,), squared pu at 1 pu.
 
     Parameters
     ----------
     design, state
         The design, and the state of the core.
     """
-    whole, modes = state.filter.full, design.core.modes
+    whole, known, b = state.filter.full, state.static, state.filter.mean[1]
     if whole is not None:
         return np.asarray(design.own @ whole.mean[1])
-    felt = modes.directions * (1.0 - state.static.signature[1])[:, None]
-    return np.asarray(design.own @ (modes.back @ (state.filter.mean[1] + felt @ state.static.theta)))
+    if known.theta.size:
+        b = b + (1.0 - known.signature[1]) * (design.core.modes.directions @ known.theta)
+    return np.asarray(design.own_of_modes @ b)
 
 
 def _attack(design: ModalDesign, state: ModalState, tick: _Tick, estimate: Estimate, named: Bools) -> Floats:
@@ -684,7 +682,7 @@ def _attack(design: ModalDesign, state: ModalState, tick: _Tick, estimate: Estim
     if not any_of(named):
         return np.zeros(named.size)
     own = own_errors(design, state.core)
-    off = tick.measured.y - own - estimate.v2_bus[design.front.prior.meters]
+    off = tick.measured.y - (1.0 + own) * estimate.v2_bus[design.front.prior.meters]
     return np.where(named & tick.measured.available, off, 0.0)
 
 
@@ -732,7 +730,7 @@ def _kinds(
     expected = estimate.v2_bus[front.prior.meters]
     variance = front.white
     if any_of(named):
-        expected = expected + own_errors(design, kernel)
+        expected = (1.0 + own_errors(design, kernel)) * expected
         variance = verdict.deviations(design.core, kernel, tick.m)[1] ** 2
     return classify(references, state.front.attack_kinds, expected, own, named, variance)
 

@@ -4,11 +4,11 @@ The filter of `gridsec.estimators.modal.filter` takes the loads' errors as a sta
 cars that no report shows, powers that are old and powers that are unread make them jump. A rival is the same
 filter since the start of the kept readings, with other errors of the loads:
 
-    w_t = rho w_(t-1) + u_t,   cov u_t = (1 - rho^2) UNREST (1 - c) S + j_t (1 - c) S
+    w_t = rho w_(t-1) + u_t,   cov u_t = (1 - rho^2) UNREST S + j_t S
 
-with a jump j_t of 0 or of one of `JUMPS` at each tick. The jumps are hypotheses with the prior `RATE` per
-tick. At each tick the likelier one is taken, given the ticks before and theta at its mean. For these jumps
-the filter is exact. With
+with a jump j_t of 0 or of one of ``JUMPS WITHIN_S / T`` at each tick. The jumps are hypotheses with the prior
+`RATE` per tick. At each tick the likelier one is taken, given the ticks before and theta at its mean. For
+these jumps the filter is exact. With
 
     evidence = log prior of the jumps + sum_t log N(nu_t; 0, V_t)
 
@@ -46,6 +46,8 @@ UNREST = (1.0, 30.0)
 """Variances of the loads' changes of the rivals, in those of the model, 1."""
 JUMPS = (10.0, 100.0)
 """Variances of a jump of all loads, in those of the loads, 1: 2 and 6 kW where 0.6 kW is stated."""
+WITHIN_S = 600.0
+"""Correlation time of the loads to which `JUMPS` refers, s: slower errors, of registers, jump by less."""
 RATE = 1.0 / 60.0
 """Prior probability of a jump of each size, per tick: kettles and cars of a street."""
 
@@ -90,7 +92,7 @@ class Rival:
     def unrest(self) -> float:
         """Variance of the loads' changes, in those of the model."""
         at = int(self.modes.loads.argmax())
-        return float(self.modes.varying[at] / ((1.0 - self.modes.model.lasting) * self.modes.loads[at]))
+        return float(self.modes.varying[at] / self.modes.loads[at])
 
     @property
     def evidence(self) -> float:
@@ -246,15 +248,18 @@ def _jump(  # noqa: PLR0917  # the states of both parts, and one tick
 ) -> tuple[float, float]:
     """The likeliest jump of a tick, in the variances of the loads, and the logarithm of its prior."""
     rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
-    sizes, priors = (0.0, *JUMPS), [log(1.0 - len(JUMPS) * RATE), *[log(RATE)] * len(JUMPS)]
-    varying = (1.0 - modes.model.lasting) * modes.loads
+    scale = WITHIN_S / modes.model.time_s
+    sizes, priors = (
+        (0.0, *(scale * each for each in JUMPS)),
+        [log(1.0 - len(JUMPS) * RATE), *[log(RATE)] * len(JUMPS)],
+    )
     if state.full is None:
         _, _, v = modal.predicted(modes, state.cov, rho, rho_b)
         g = known.signature
         nu = m @ modes.U - rho * state.mean[0] - rho_b * state.mean[1]
         if modes.sign.size:
             nu -= (1.0 - rho * g[0] - rho_b * g[1]) * (modes.directions @ known.theta)
-        w = v + np.multiply.outer(sizes, varying)
+        w = v + np.multiply.outer(sizes, modes.loads)
         each = (priors - 0.5 * (nu * nu / w + np.log(w)).sum(axis=1)).tolist()
     else:
         n = np.arange(modes.size) if seen is None else indices(seen)
@@ -279,7 +284,7 @@ def _jumped(modes: Modes, state: FilterState, h: float, size: float) -> FilterSt
         return state
     more = size * exp(2.0 * h / modes.model.time_s)
     cov, full = state.cov.copy(), state.full
-    cov[0] += more * (1.0 - modes.model.lasting) * modes.loads
+    cov[0] += more * modes.loads
     if full is not None:
         w, both, b = full.blocks
         full = replace(full, blocks=(w + more * modes.jumps, both, b))

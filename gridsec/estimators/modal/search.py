@@ -224,7 +224,7 @@ def search(
         keys = list(met)
         less = excess(np.stack([np.frombuffer(key, dtype=np.bool_) for key in keys]), whole, read)
         found.append({key: met[key] + cost - float(one) for key, one in zip(keys, less, strict=True)})
-    return _identified(tuple(end.problem for end in ends), tuple(found))
+    return identified(tuple(end.problem for end in ends), tuple(found))
 
 
 def _descended(problem: SearchProblem, starts: tuple[Bools, ...], groups: Groups) -> Tableau:
@@ -361,8 +361,24 @@ def _neighbours(best: Tableau, found: dict[bytes, float], least: float = BELIEVE
         found.setdefault(chosen.tobytes(), best.cost + float(both[i, j]))
 
 
-def _identified(problems: tuple[SearchProblem, ...], found: tuple[dict[bytes, float], ...]) -> Identification:
-    """Weights of the sets found, and the meters without which nothing is left."""
+def costs_of(found: Identification) -> list[dict[bytes, float]]:
+    """Costs of explanations under each model of the loads, by their bytes; the weights sum to a cost of 0."""
+    out: list[dict[bytes, float]] = [{} for _ in found.problems]
+    for model, chosen, weight in zip(found.model.tolist(), found.chosen, found.weight, strict=True):
+        out[model][chosen.tobytes()] = -2.0 * float(np.log(weight))
+    return out
+
+
+def identified(problems: tuple[SearchProblem, ...], found: Sequence[dict[bytes, float]]) -> Identification:
+    """Weights of sets, and the meters without which nothing is left.
+
+    Parameters
+    ----------
+    problems
+        The problem under each model of the loads.
+    found
+        Costs of the sets under each model, by their bytes.
+    """
     every = sorted((each[key], k, key) for k, each in enumerate(found) for key in each)
     costs = np.array([one for one, _, _ in every])
     weight = np.exp(-0.5 * (costs - costs[0]))

@@ -1,6 +1,6 @@
 """Errors that last and are not diagonal in the modes: directions with a Gaussian amount, exactly.
 
-The filter of `gridsec.estimators.modal.filter` runs with ``B = kappa D + c S``. The rest of B is that of ``G
+The filter of `gridsec.estimators.modal.filter` runs with ``B = kappa D``. The rest of B is that of ``G
 theta`` with ``theta ~ N(0, diag(sign))``. Its effect on the innovations since the start is known, mode by
 mode: with the signature of a constant unit error,
 

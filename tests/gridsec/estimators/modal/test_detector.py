@@ -293,7 +293,7 @@ def test_the_information_about_the_busbar_is_exact(make: object) -> None:
     response = np.array([after(one)[0] for one in np.eye(ticks * p).reshape(-1, ticks, p)]).reshape(ticks, p)
     at, apart = np.arange(p), np.abs(np.subtract.outer(np.arange(ticks), np.arange(ticks)))
     rho = np.exp(-apart / model.time_s)
-    w = (1.0 - model.lasting) * model.loads(at)
+    w = model.loads(at)
     variance = float(
         np.sum(rho * (response @ w @ response.T)) + np.sum(response @ model.static(at) @ response.T)
     )

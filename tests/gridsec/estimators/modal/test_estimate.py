@@ -37,18 +37,18 @@ def joint(  # noqa: PLR0917  # everything that moves the readings
 ) -> tuple[Floats, Floats]:
     """Mean and variance at all places from the joint Gaussian of all readings at intervals of 1 s."""
     at, T = np.arange(model.meters.size), len(m)
-    p, c, n = at.size, model.lasting, model.variance.size
+    p, n = at.size, model.variance.size
     rho = np.exp(-1.0 / model.time_s)
     S, D, B = model.loads(at), model.noise(at), model.static(at)
     V, cross = np.empty((T, p, T, p)), np.empty((n, T, p))
     u = (np.arange(T) >= onset).astype(np.float64)
     H = model.phases(at)
-    lasts = c * model.of_meters + model.busbar * model.busbar_of @ H.T
+    lasts = model.busbar * model.busbar_of @ H.T
     for t in range(T):
         for s in range(T):
-            V[t, :, s] = rho ** abs(t - s) * (1 - c) * S + B + (t == s) * D
+            V[t, :, s] = rho ** abs(t - s) * S + B + (t == s) * D
             V[t, :, s] += std**2 * u[t] * u[s] * G @ G.T
-        cross[:, t] = rho ** (T - 1 - t) * (1 - c) * model.of_meters + lasts
+        cross[:, t] = rho ** (T - 1 - t) * model.of_meters + lasts
         cross[:, t] += std**2 * u[t] * effect @ G.T
     cross[:, T - 1] += model.flicker * model.busbar_of @ H.T
     flat = cross.reshape(n, T * p)
@@ -57,11 +57,10 @@ def joint(  # noqa: PLR0917  # everything that moves the readings
     return gain @ m.ravel(), own - (gain * flat).sum(axis=1)
 
 
-@pytest.mark.parametrize("lasting", [0.0, 0.3])
 @pytest.mark.parametrize("fault", ["none", "meter", "power", "busbar"])
-def test_equals_the_joint_gaussian(lasting: float, fault: str) -> None:
+def test_equals_the_joint_gaussian(fault: str) -> None:
     """Mean and variance at all buses, without a fault and with a known one; two classes by the jitter."""
-    model = some_meters(lasting=lasting)
+    model = some_meters()
     made, onset, std = modes(model), 4, 0.01
     assert made.sign.size > 0
     every, n = np.arange(9), model.variance.size
@@ -190,12 +189,12 @@ def test_the_honest_source_agrees_with_its_model() -> None:
 
 def test_factors_of_the_regression_are_the_whole() -> None:
     """``of_b`` and ``of_e`` by the modes and a few directions: the busbar's, and those of unequal meters."""
-    model = some_meters(lasting=0.3)
+    model = some_meters()
     made = modes(model)
     prepared = estimate.estimator(made)
     w, b, e = np.random.default_rng(4).standard_normal((3, 5))
     expected = prepared.of_w @ w + prepared.of_b @ b + prepared.of_e @ e
     assert np.allclose(estimate._mean(prepared, w, b, e), expected, rtol=0.0, atol=1e-12)
-    even = some_meters(lasting=0.3)
+    even = some_meters()
     even = replace(even, white=np.full(5, 1e-5), fixed=np.full(5, 2e-5))
     assert estimate.estimator(modes(even)).left.shape[1] <= 2

@@ -45,11 +45,10 @@ def covariance(made: Modes, state: modal.FilterState) -> Floats:
     return np.block(blocks)
 
 
-@pytest.mark.parametrize("lasting", [0.0, 0.4])
 @pytest.mark.parametrize("fixed_s", [np.inf, 3000.0])
-def test_equals_the_dense_filter_where_b_is_proportional(lasting: float, fixed_s: float) -> None:
+def test_equals_the_dense_filter_where_b_is_proportional(fixed_s: float) -> None:
     """Innovations, their covariance, means and covariances; intervals that change."""
-    model = proportional(lasting=lasting, fixed_s=fixed_s)
+    model = proportional(fixed_s=fixed_s)
     made, random = modes(model), np.random.default_rng(1)
     assert made.sign.size == 0
     state, dense, t = modal.start(made, 0.0), Dense(model), 0.0
@@ -66,11 +65,11 @@ def test_equals_the_dense_filter_where_b_is_proportional(lasting: float, fixed_s
 
 
 @pytest.mark.parametrize("make", [model_of, mixed])
-@pytest.mark.parametrize(("lasting", "fixed_s"), [(0.0, np.inf), (0.4, np.inf), (0.4, 3000.0)])
-def test_directions_make_it_exact_for_every_b(make: object, lasting: float, fixed_s: float) -> None:
+@pytest.mark.parametrize("fixed_s", [np.inf, 3000.0])
+def test_directions_make_it_exact_for_every_b(make: object, fixed_s: float) -> None:
     """A busbar class, and two classes of meters: innovations and the mean of what lasts."""
-    given = {"lasting": lasting, "fixed_s": fixed_s}
-    model = mixed(**given) if make is mixed else model_of(tree(12, np.random.default_rng(3)), **given)
+    of_tree = tree(12, np.random.default_rng(3))
+    model = mixed(fixed_s=fixed_s) if make is mixed else model_of(of_tree, fixed_s=fixed_s)
     made, random = modes(model), np.random.default_rng(2)
     assert made.sign.size > 0
     state, more, dense, t = modal.start(made, 0.0), static.start(made), Dense(model), 0.0
@@ -107,11 +106,10 @@ def masks(kind: str, size: int, ticks: int) -> Bools:
 
 @pytest.mark.parametrize("make", [proportional, model_of, mixed])
 @pytest.mark.parametrize("kind", ["outage", "half", "random", "alternating"])
-@pytest.mark.parametrize("lasting", [0.0, 0.4])
-def test_missing_readings_are_exact(make: object, kind: str, lasting: float) -> None:
+def test_missing_readings_are_exact(make: object, kind: str) -> None:
     """Scores of the innovations, means and covariance of the dense filter; intervals that change."""
     tree12 = tree(12, np.random.default_rng(3))
-    model = model_of(tree12, lasting=lasting) if make is model_of else make(lasting=lasting)  # type: ignore
+    model = model_of(tree12) if make is model_of else make()  # type: ignore[operator]
     made, source = modes(model), Source(model, np.random.default_rng(5))
     seen, dense, p = masks(kind, made.size, 60), Dense(model), made.size
     state, more = modal.start(made, 0.0), static.start(made)

@@ -1,4 +1,4 @@
-"""Final names of the monitor: searches in turn, or a sole fault with enough readings."""
+"""The monitor: final names by searches in turn or a sole fault; errors of registers in proportion."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from gridsec.arrays import Bools
-from gridsec.estimators.modal.monitor import CONFIRM, confirmed
+from gridsec.estimators.modal.monitor import CONFIRM, confirmed, design, init, own_errors, step
 from gridsec.estimators.modal.replay import Reading
 from gridsec.estimators.modal.search import Identification
+from gridsec.interface import Decision
+from tests.gridsec.estimators.sequential.test_monitor import prepare
+from tests.gridsec.street import Street, make_plant
 
 P = 5
 
@@ -56,3 +59,35 @@ def test_a_part_of_several_faults_needs_searches_in_turn(faults: tuple[int, ...]
 def test_meters_that_are_named_by_turns_of_different_length_are_apart() -> None:
     streak = CONFIRM * mask(1) + mask(3)
     assert confirmed(found(1, 3), mask(1, 3), streak, ticks(None, None)).tolist() == mask(1).tolist()
+
+
+def test_a_meter_that_is_accused_but_not_named_is_not_final() -> None:
+    """Searches in turn count for the likeliest explanation; the last one has to name the meter."""
+    streak = CONFIRM * mask(1, 3)
+    assert confirmed(found(1, 3), mask(3), streak, ticks(None, None)).tolist() == mask(3).tolist()
+
+
+def test_masked_meters_leave_no_fault_alone() -> None:
+    """Without the ticks since the onset, a sole fault needs searches in turn."""
+    assert not confirmed(found(2), mask(2), NONE + mask(2), []).any()
+
+
+def test_errors_of_registers_follow_the_voltage() -> None:
+    """The voltage falls by 5 % once errors are learned: 20 standard deviations of 500 readings, and CLEAN."""
+    plant = make_plant(
+        np.random.default_rng(5), customers=12, drop=0.03, inverters=np.zeros(0, dtype=np.intp)
+    )
+    front = prepare(plant)
+    made = design(plant, doubt=front.doubt, step_s=1.0)
+    street, largest = Street(plant, np.random.default_rng(6)), 0.0
+    state = init(made, street.t)
+    for k in range(900):
+        street.advance(1.0)
+        street.v0 = 1.0 if k < 400 else 0.95
+        state, _, verdict = step(made, state, street.frame())
+        largest = max(largest, state.core.detector.log_m)
+        assert verdict.decision is Decision.CLEAN or k < 10
+    assert largest < 0.6 * made.core.limit
+    off = own_errors(made, state.core) - 2.0 * street.bias
+    # All meters share the error of the busbar's.
+    assert np.abs(off - off.mean()).max() < 5e-4

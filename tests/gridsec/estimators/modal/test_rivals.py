@@ -42,7 +42,7 @@ def test_evidence_and_scores_equal_those_of_the_dense_filter(make: object, kind:
         rho2 = rho**2 if k else 1.0
         size = mine.loads - rho2 * before.loads - (1.0 - rho2) * UNREST[unrest]
         for each in (dense, without):
-            each.cov[:p, :p] += size / rho2 * (1.0 - model.lasting) * model.loads(np.arange(p))
+            each.cov[:p, :p] += size / rho2 * model.loads(np.arange(p))
             nu, V = each.step(1.0 if k else 0.0, readings[k], seen[k], level=float(k >= onset))
         jumped = mine.jumps != before.jumps
         exact += np.log(RATE if jumped else 1.0 - 2.0 * RATE)

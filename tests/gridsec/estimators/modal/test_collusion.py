@@ -1,0 +1,128 @@
+"""Check of a naming under collusion: no meter is named that other meters with one amount may replace."""
+
+from __future__ import annotations
+
+from itertools import product
+from math import inf
+
+import numpy as np
+import pytest
+
+from gridsec.arrays import Bools, Floats
+from gridsec.estimators.modal import collusion
+from gridsec.estimators.modal.costs import SearchProblem, cost, costs, penalties
+from gridsec.estimators.modal.search import ALIKE, Identification
+from tests.gridsec.estimators.modal.test_search import problem
+
+METERS, NOISE, SHARED = 12, 0.01, 3.0
+"""Meters of a street in two laterals of six, white variance of each, variance that a lateral shares."""
+
+
+def street(lie: Floats, seed: int = 0, charge: float = 5.0) -> SearchProblem:
+    """Scores of a lie, (p,), where the voltages of each lateral move alike; one power without an effect."""
+    V = NOISE * np.eye(METERS) + SHARED * np.kron(np.eye(2), np.ones((6, 6)))
+    F = np.zeros((METERS + 1, METERS + 1))
+    F[:METERS, :METERS] = np.linalg.inv(V)
+    noise = np.linalg.cholesky(V) @ np.random.default_rng(seed).standard_normal(METERS)
+    y = np.append(F[:METERS, :METERS] @ (lie + noise), 0.0)
+    bound = np.full(METERS + 1, inf)
+    return SearchProblem(y, F, np.ones(METERS + 1), METERS, np.append(np.zeros(METERS), charge), bound)
+
+
+def explanation(given: SearchProblem, accused: Bools) -> Identification:
+    """One explanation, which names all meters that it accuses, (p,)."""
+    chosen = np.append(accused, np.zeros(given.y.size - given.meters, dtype=np.bool_))
+    return Identification(chosen[None], np.zeros(1, np.intp), np.ones(1), accused, (given,))
+
+
+def contested(given: Identification, masked: Bools, most: int) -> Bools:
+    """Named meters that other explanations replace, (p,)."""
+    return given.named & ~collusion.weighed(given, masked, most).named
+
+
+def some(*meters: int) -> Bools:
+    """Places of meters, (p,)."""
+    return np.isin(np.arange(METERS), meters)
+
+
+NONE = some()
+
+
+def test_the_evidence_is_the_cost_without_the_penalty_of_meters() -> None:
+    """Own amounts for one meter; for more, the mean of the likelihoods with own amounts and amounts alike."""
+    given = problem(3, p=8, others=2)
+    one, two = np.zeros((2, 10), dtype=np.bool_)
+    one[[2, 9]], two[[1, 4, 9]] = True, True
+    own, both = collusion._evidence(given, np.stack([one, two]))
+    assert np.isclose(own, cost(given, one) - penalties(8)[1])
+    each = [cost(given, two), float(costs(given, two[None], ALIKE)[0])]
+    mean = -2.0 * np.log(np.mean(np.exp(-0.5 * np.array(each))))
+    assert np.isclose(both, mean - penalties(8)[2])
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_set_with_one_amount_is_the_best_of_all(seed: int) -> None:
+    """Against all subsets of the other meters with an amount of the sign that was asked for."""
+    given, room = street(0.8 * some(0, 1, 2, 3).astype(np.float64), seed), 4
+    own, barred = np.append(some(7), False), some(11)
+    found = collusion._relaxed(given, own, barred, 1.0, NONE)
+    least, inside = found.best(0.5, room)
+    assert set(found.at.tolist()) == set(range(METERS)) - {7, 11}
+
+    def exact(members: Bools) -> float:
+        column = np.zeros(METERS + 1)
+        column[found.at[members]] = 1.0
+        W = np.stack([own.astype(np.float64), column], axis=1)
+        F, y = W.T @ given.F @ W, W.T @ given.y
+        if np.linalg.solve(np.eye(2) + F, y)[1] < 0.0:
+            return inf
+        whole = np.linalg.slogdet(np.eye(2) + F)[1] - y @ np.linalg.solve(np.eye(2) + F, y)
+        alone = np.log1p(F[0, 0]) - y[0] ** 2 / (1.0 + F[0, 0])
+        return float(whole - alone)
+
+    every = (np.array(each, dtype=np.bool_) for each in product((False, True), repeat=10))
+    assert np.isclose(least, exact(inside))
+    assert np.isclose(least, min(exact(each) for each in every if 0 < each.sum() <= room))
+
+
+def test_an_honest_meter_amid_colluding_ones_is_contested() -> None:
+    """Four of a lateral are off by 0.8: its two honest meters seem to be off by the reverse."""
+    given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
+    honest, false = explanation(given, some(4, 5)), explanation(given, some(0, 1, 2, 3))
+    assert (contested(honest, NONE, 4) == some(4, 5)).all()
+    # The promise excludes the reverse where two meters are masked already, and not the truth's own.
+    assert not contested(honest, some(10, 11), 4).any()
+    assert (contested(false, NONE, 4) == some(0, 1, 2, 3)).all()
+
+
+def test_meters_that_nothing_replaces_are_named() -> None:
+    """Two meters of different laterals, off by far more than others can feign."""
+    lie = 2.0 * some(0, 6).astype(np.float64)
+    given = street(lie)
+    assert not contested(explanation(given, some(0, 6)), NONE, 4).any()
+    opposite = street(lie * np.where(some(6), -1.0, 1.0))
+    assert not contested(explanation(opposite, some(0, 6)), NONE, 4).any()
+
+
+def test_a_sole_fault_is_left_to_the_prior() -> None:
+    """Without masked meters one fault is likelier than many; with them it is contested."""
+    given = street(0.8 * some(0, 1, 2, 3, 4).astype(np.float64))
+    one = explanation(given, some(5))
+    assert not contested(one, NONE, 5).any()
+    assert (contested(one, some(11), 6) == some(5)).all()
+
+
+def test_an_explanation_beyond_the_promise_names_nothing() -> None:
+    """More accused meters than the promise or a third, those that are masked included."""
+    given = street(2.0 * some(0, 1, 6, 7).astype(np.float64))
+    four = explanation(given, some(0, 1, 6, 7))
+    assert not contested(four, NONE, 1).any()
+    assert (contested(four, some(11), 1) == four.named).all()
+
+
+def test_nothing_named_is_not_contested() -> None:
+    """Explanations that name no meter."""
+    given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
+    shown = explanation(given, some(4, 5))
+    nothing = Identification(shown.chosen, shown.model, shown.weight, NONE, shown.problems)
+    assert not contested(nothing, NONE, 4).any()
