@@ -4,13 +4,15 @@ The penalty of a set of meters is a prior: few are likelier than many. It may de
 alone explains the readings. Where an explanation has several faults, or meters are masked already, an
 adversary has chosen the meters, and its choice has no prior. Let C be the accused meters of one sign in the
 likeliest explanation J, and L the cost without the penalty of meters. A set g of other meters in place of C
-is an explanation of its own, with the cost beyond that of all others together
+is an explanation of its own, at ``max(0, L((J - C) + g) - L(J))`` beyond J. C is not named where that is less
+than
 
-    D = max(0, L((J - C) + g) - L(J)) / max(1, MISFIT |L(J)| / (2 log(1 / DOUBT))),
+    max(2 log(1 / DOUBT), MISFIT (L(J - C) - L(J)))
 
-where D < 2 log(1 / DOUBT): C is then not named. Steps and ramps describe a drift of unknown onset and shape
-to a share of its evidence only, `MISFIT`. The promise limits g: (J - C) + g and the masked meters are at most
-M or a third, whichever is larger. An explanation of more meters names none.
+Steps and ramps describe a drift of unknown onset and shape to a share of its evidence only, `MISFIT`. The
+promise limits g: (J - C) + g and the masked meters are at most M or a third, whichever is larger. An
+explanation of more meters names none. Meters of one sign are on trial together: one that nothing replaces
+protects the others.
 
 **Search of g.** Given the amounts of the rest J - C, g has the information F and the scores y. One amount x
 has the relaxation
@@ -74,20 +76,37 @@ def weighed(found: Identification, masked: Bools, most: int) -> Identification:
     model = int(found.model[0])
     problem, amount = found.problems[model], np.zeros(J.size)
     amount[J] = mean_amounts(problem, J)
-    own = float(_evidence(problem, J[None])[0])
-    certain = -2.0 * log(DOUBT)
-    margin, by_model, more = max(certain, MISFIT * abs(own)), costs_of(found), False
+    by_model, least = costs_of(found), -2.0 * log(DOUBT)
+    contested = np.zeros(p, dtype=np.bool_)
     for sign in (1.0, -1.0):
         # The onset may be older than that of a masked meter, which J then has, too.
         accused = J[:p] & ~masked & (sign * amount[:p] > 0.0)
-        if any_of(accused & named):
-            each, other = min(_instead(problem, J, amount, accused, masked, most), key=lambda pair: pair[0])
-            # All explanations together have the cost 0.
-            cost = max(0.0, each - own) * certain / margin
+        if not any_of(accused & named):
+            continue
+        own, without = _own(problem, J, accused, sign, masked)
+        each, other = min(_instead(problem, J, amount, accused, masked, most), key=lambda pair: pair[0])
+        more = max(0.0, each - own)
+        if more < max(least, MISFIT * (without - own)):
+            contested |= accused & named
             key = other.tobytes()
-            if cost < min(certain, by_model[model].get(key, inf)):
-                by_model[model][key], more = cost, True
-    return identified(found.problems, by_model) if more else found
+            # No more than J, whose prior is better.
+            cost = by_model[model][J.tobytes()] + max(more, LEAST)
+            by_model[model][key] = min(cost, by_model[model].get(key, inf))
+    if not any_of(contested):
+        return found
+    out = identified(found.problems, by_model)
+    return replace(out, named=out.named & ~contested)
+
+
+def _own(problem: SearchProblem, J: Bools, accused: Bools, sign: float, masked: Bools) -> tuple[float, float]:
+    """L of the explanation, with one amount of the meters accused where that is less, and without them."""
+    rest = J.copy()
+    rest[: problem.meters] &= ~accused
+    whole, without = _evidence(problem, np.stack([J, rest])).tolist()
+    one = _relaxed(problem, rest, ~accused, sign, masked)
+    every = np.ones((1, one.at.size))
+    alike = one.costs(every @ one.y, ((every @ one.F) * every).sum(axis=1))
+    return min(whole, without + float(alike[0])), without
 
 
 def _instead(  # noqa: PLR0917  # one explanation
@@ -104,7 +123,7 @@ def _instead(  # noqa: PLR0917  # one explanation
         for each in (rest,) if np.array_equal(without, rest) else (rest, without):
             one = _relaxed(problem, each, accused, sign, masked)
             room = most - int(np.count_nonzero(each[:p] | masked))
-            cost, inside = one.best(size, room) if room > 0 else (0.0, np.zeros(0, dtype=np.bool_))
+            cost, inside = one.best(size, room)
             if any_of(inside):
                 both = each.copy()
                 both[one.at[inside]] = True
@@ -162,12 +181,14 @@ class _Relaxed:
     def best(self, amount: float, room: int) -> tuple[float, Bools]:
         """Least cost of one amount, at most 0, and its set, (k,); at most `room` counted meters."""
         least, best = 0.0, np.zeros(self.at.size, dtype=np.bool_)
+        if not best.size or room <= 0:
+            return least, best
         start = np.full(self.at.size, HALF)
         for _ in range(ROUNDS):
             share, before = self._share(amount, start), least
             order = np.argsort(-share, kind="stable")
             order = order[np.cumsum(self.counted[order]) <= room]
-            nested = self._costs(
+            nested = self.costs(
                 np.cumsum(self.y[order]), np.cumsum(np.cumsum(self.F[np.ix_(order, order)], 0), 1).diagonal()
             )
             for k in {int(nested.argmin()), max(1, int((share[order] > HALF).sum())) - 1, order.size - 1}:
@@ -197,9 +218,9 @@ class _Relaxed:
         )
         return np.asarray(found.x)
 
-    def _costs(self, a: Floats, b: Floats) -> Floats:
-        """Cost of one amount with scores a and information b."""
-        b = np.maximum(b, 0.0)
+    def costs(self, a: Floats, b: Floats) -> Floats:
+        """Cost of one amount with scores a and information b; an amount of the other sign gains nothing."""
+        a, b = np.maximum(a, 0.0), np.maximum(b, 0.0)
         return np.asarray(np.log1p(self.s2 * b) - a * a / (b + 1.0 / self.s2))
 
     def _improved(self, cost: float, inside: Bools, room: int) -> tuple[float, Bools]:
@@ -209,7 +230,7 @@ class _Relaxed:
             count = int(np.count_nonzero(inside & self.counted)) + sign * self.counted
             some = np.count_nonzero(inside) + sign > 0
             b = float(rows @ inside) + 2.0 * sign * rows + self.F.diagonal()
-            each = self._costs(float(self.y @ inside) + sign * self.y, b)
+            each = self.costs(float(self.y @ inside) + sign * self.y, b)
             each = np.where(some & (count <= room), each, inf)
             j = int(each.argmin())
             if not each[j] < cost - LEAST:

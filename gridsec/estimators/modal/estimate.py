@@ -1,7 +1,7 @@
 """Voltages at all places from the filter, corrected for suspected faults.
 
 The squared voltage at place x exceeds the front end's model by ``w_x + b_x + e_x``: errors of loads that
-come and go, what lasts (loads, and the class of the busbar's meter), and the flicker of the busbar's meter.
+come and go, what lasts (the class of the busbar's meter), and the flicker of the busbar's meter.
 Given the states w, b and the white errors e of the members, in their modes,
 
     E w_x = S_xT U lam^-1 w        E b_x = C_x B^-1 b,  C = s0^2 H H'        E e_x = phi H_x H' U e

@@ -43,7 +43,7 @@ from gridsec.estimators.sequential.posterior import voltage_prior
 FIXED_S = YEAR_S
 """Time constant of fixed errors, s. Meters age over years; with a day, lies of 0.5 %/h stay hidden."""
 REPORTED_S = 3600.0
-"""Correlation time of the errors of reported powers, s: parts of loads, which change within an hour."""
+"""Least correlation time where errors of reported powers last, s: parts of loads, which change in an hour."""
 SAME = 1e-9
 """Relative difference below which two ratios or two eigenvalues are equal, 1: rounding."""
 

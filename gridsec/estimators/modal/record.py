@@ -42,7 +42,10 @@ WIDEST = 2.5
 TOLERANCE = 1.0 + 1e-9
 """Factor for rounding, 1."""
 _PREFIX = "filter."
-_ROWS = ("w", "b", "var_w", "cov_wb", "var_b", "felt_w", "felt_b", "information", "busbar", "meters", "t")
+_ROWS = (
+    *("w", "b", "var_w", "cov_wb", "var_b", "felt_w", "felt_b"),
+    *("information", "busbar", "meters", "t", "time_s"),
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,6 +156,7 @@ def to_arrays(modes: Modes, record: Record | None) -> dict[str, Floats]:
         _padded(known.theta[: modes.busbar], p),
         _padded(known.theta[modes.busbar :], p),
         np.full(p, state.t),
+        np.full(p, modes.model.time_s),
     )
     return dict(zip((_PREFIX + name for name in _ROWS), rows, strict=True))
 
@@ -175,7 +179,9 @@ def is_own(name: str) -> bool:
 
 
 def from_arrays(modes: Modes, arrays: Mapping[str, Floats]) -> Record | None:
-    """Record from the arrays of `to_arrays`; None without any of them.
+    """Record from the arrays of `to_arrays`; None without any of them, and of another model of the loads.
+
+    With another correlation time T of the loads, the variances have another meaning.
 
     Raises
     ------
@@ -183,10 +189,11 @@ def from_arrays(modes: Modes, arrays: Mapping[str, Floats]) -> Record | None:
         If the arrays do not fit the modes; names every problem.
     """
     names = [_PREFIX + name for name in _ROWS]
-    if not any(name in arrays for name in names):
+    time_s = arrays.get(_PREFIX + "time_s")
+    if time_s is None or (time_s != modes.model.time_s).any():
         return None
     raise_if_any(_problems(modes, arrays, names))
-    w, b, var_w, cov_wb, var_b, felt_w, felt_b, information, busbar, meters, t = (
+    w, b, var_w, cov_wb, var_b, felt_w, felt_b, information, busbar, meters, t, _ = (
         arrays[name] for name in names
     )
     blank = static.start(modes)

@@ -6,9 +6,9 @@ filter since the start of the kept readings, with other errors of the loads:
 
     w_t = rho w_(t-1) + u_t,   cov u_t = (1 - rho^2) UNREST S + j_t S
 
-with a jump j_t of 0 or of one of ``JUMPS WITHIN_S / T`` at each tick. The jumps are hypotheses with the prior
-`RATE` per tick. At each tick the likelier one is taken, given the ticks before and theta at its mean. For
-these jumps the filter is exact. With
+with a jump j_t of 0 or of one of `JUMPS`, times `WITHIN_S` over T, at each tick. The jumps are hypotheses
+with the prior `RATE` per tick. At each tick the likelier one is taken, given the ticks before and theta at
+its mean. For these jumps the filter is exact. With
 
     evidence = log prior of the jumps + sum_t log N(nu_t; 0, V_t)
 
@@ -37,7 +37,7 @@ from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal import full as exact
 from gridsec.estimators.modal import replay, signatures
 from gridsec.estimators.modal.filter import FilterState, Update
-from gridsec.estimators.modal.model import Modes
+from gridsec.estimators.modal.model import REPORTED_S, Modes
 from gridsec.estimators.modal.replay import History, Suspected
 from gridsec.estimators.modal.signatures import Joint, Onsets
 from gridsec.estimators.modal.static import Static
@@ -47,7 +47,10 @@ UNREST = (1.0, 30.0)
 JUMPS = (10.0, 100.0)
 """Variances of a jump of all loads, in those of the loads, 1: 2 and 6 kW where 0.6 kW is stated."""
 WITHIN_S = 600.0
-"""Correlation time of the loads to which `JUMPS` refers, s: slower errors, of registers, jump by less."""
+"""Correlation time of the loads to which `JUMPS` refers, s: slower errors, of registers, jump by less.
+
+The variances are those times `WITHIN_S` over the correlation time, between its share of `REPORTED_S` and 1.
+"""
 RATE = 1.0 / 60.0
 """Prior probability of a jump of each size, per tick: kettles and cars of a street."""
 
@@ -248,7 +251,7 @@ def _jump(  # noqa: PLR0917  # the states of both parts, and one tick
 ) -> tuple[float, float]:
     """The likeliest jump of a tick, in the variances of the loads, and the logarithm of its prior."""
     rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
-    scale = WITHIN_S / modes.model.time_s
+    scale = min(1.0, WITHIN_S / min(modes.model.time_s, REPORTED_S))
     sizes, priors = (
         (0.0, *(scale * each for each in JUMPS)),
         [log(1.0 - len(JUMPS) * RATE), *[log(RATE)] * len(JUMPS)],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 from math import inf
 
@@ -18,20 +19,23 @@ METERS, NOISE, SHARED = 12, 0.01, 3.0
 """Meters of a street in two laterals of six, white variance of each, variance that a lateral shares."""
 
 
-def street(lie: Floats, seed: int = 0, charge: float = 5.0) -> SearchProblem:
-    """Scores of a lie, (p,), where the voltages of each lateral move alike; one power without an effect."""
+def street(lie: Floats, seed: int = 0, charge: float = 5.0, power: float = 0.0) -> SearchProblem:
+    """Scores of a lie, (p,), where the voltages of each lateral move alike.
+
+    power: amount of a false power, which moves the second lateral's meters apart.
+    """
     V = NOISE * np.eye(METERS) + SHARED * np.kron(np.eye(2), np.ones((6, 6)))
-    F = np.zeros((METERS + 1, METERS + 1))
-    F[:METERS, :METERS] = np.linalg.inv(V)
+    W = np.hstack([np.eye(METERS), np.append(np.zeros(6), np.linspace(-1.0, 1.0, 6))[:, None]])
     noise = np.linalg.cholesky(V) @ np.random.default_rng(seed).standard_normal(METERS)
-    y = np.append(F[:METERS, :METERS] @ (lie + noise), 0.0)
+    F = W.T @ np.linalg.solve(V, W)
+    y = W.T @ np.linalg.solve(V, W @ np.append(lie, power) + noise)
     bound = np.full(METERS + 1, inf)
     return SearchProblem(y, F, np.ones(METERS + 1), METERS, np.append(np.zeros(METERS), charge), bound)
 
 
-def explanation(given: SearchProblem, accused: Bools) -> Identification:
+def explanation(given: SearchProblem, accused: Bools, *, power: bool = False) -> Identification:
     """One explanation, which names all meters that it accuses, (p,)."""
-    chosen = np.append(accused, np.zeros(given.y.size - given.meters, dtype=np.bool_))
+    chosen = np.append(accused, power)
     return Identification(chosen[None], np.zeros(1, np.intp), np.ones(1), accused, (given,))
 
 
@@ -125,4 +129,30 @@ def test_nothing_named_is_not_contested() -> None:
     given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
     shown = explanation(given, some(4, 5))
     nothing = Identification(shown.chosen, shown.model, shown.weight, NONE, shown.problems)
-    assert not contested(nothing, NONE, 4).any()
+    assert collusion.weighed(nothing, NONE, 4) is nothing
+
+
+def test_a_false_power_beside_it_protects_no_manipulated_meter() -> None:
+    """The margin follows from the evidence against the meter, not from that of a power that is far off."""
+    given = street(0.6 * some(0).astype(np.float64), power=8.0)
+    both = explanation(given, some(0), power=True)
+    evidence = collusion._evidence(given, np.stack([np.append(some(0), True), np.append(NONE, True)]))
+    assert collusion.MISFIT * abs(evidence[0]) > evidence[1] - evidence[0] > 20.0
+    assert not contested(both, NONE, 4).any()
+
+
+def test_the_other_set_is_no_likelier_than_the_explanation() -> None:
+    """It is reported behind the explanation, also where it fits better."""
+    given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
+    out = collusion.weighed(explanation(given, some(4, 5)), NONE, 4)
+    assert (out.chosen[0, :METERS] == some(4, 5)).all()
+    assert (out.chosen[1, :METERS] == some(0, 1, 2, 3)).all()
+    assert out.weight[0] > out.weight[1] > 0.4
+
+
+def test_meters_without_readings_replace_nothing() -> None:
+    """All other meters are silent since the onset: there is no set to look for."""
+    given = street(2.0 * some(0, 6).astype(np.float64))
+    seen = np.append(some(0, 6), False)
+    silent = replace(given, y=given.y * seen, F=given.F * np.outer(seen, seen))
+    assert not contested(explanation(silent, some(0, 6)), NONE, 4).any()

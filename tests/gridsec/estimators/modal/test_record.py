@@ -122,3 +122,14 @@ def test_arrays_that_do_not_fit_are_refused(name: str, value: Floats | None, wha
         arrays[name] = value
     with pytest.raises(ValueError, match=what):
         record.from_arrays(made, arrays)
+
+
+def test_a_record_of_another_model_of_the_loads_is_left_out() -> None:
+    """Another correlation time, and arrays without one, as stored by earlier versions."""
+    made, state, known = run(proportional())
+    arrays = record.to_arrays(made, record.made(made, state, known))
+    other = modes(replace(made.model, time_s=2.0 * made.model.time_s))
+    assert record.from_arrays(made, arrays) is not None
+    assert record.from_arrays(other, arrays) is None
+    del arrays["filter.time_s"]
+    assert record.from_arrays(made, arrays) is None
