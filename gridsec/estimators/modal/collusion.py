@@ -89,7 +89,7 @@ def weighed(found: Identification, masked: Bools, most: int) -> Identification:
         if more < max(least, MISFIT * (without - own)):
             contested |= accused & named
             key = other.tobytes()
-            # No more than J, whose prior is better.
+            # No more than J: few meters are likelier than many.
             cost = by_model[model][J.tobytes()] + max(more, LEAST)
             by_model[model][key] = min(cost, by_model[model].get(key, inf))
     if not any_of(contested):
