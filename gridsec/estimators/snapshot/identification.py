@@ -58,8 +58,10 @@ _STARTS = 8
 """Customers of the most suspicious meters, at which a search with false powers may start."""
 _BEGUN = 2
 """Starts before the rest depends on an implausible best hypothesis: many accused, or a bad fit."""
-_PAIRS, _TOGETHER = 32, 4
-"""Pairs of customers that are extended to triples; pairs and triples from which a search starts."""
+_PAIRS = 32
+"""Pairs of customers that are extended to triples, and kept triples."""
+_TOGETHER = 4
+"""Pairs, and triples, of customers with false powers, from which a search starts."""
 _MANY = 0.25
 """Part of the meters that counts as many."""
 
