@@ -38,20 +38,27 @@ from math import inf, log
 import numpy as np
 from scipy.optimize import minimize
 
-from gridsec.arrays import Bools, Floats, Ints, any_of
-from gridsec.estimators.modal.costs import SearchProblem, costs, informed, mean_amounts, penalties
+from gridsec.arrays import Bools, Floats, Ints, any_of, submatrix
+from gridsec.estimators.modal.costs import (
+    SearchProblem,
+    Tableau,
+    costs,
+    informed,
+    mean_amounts,
+    mean_likelihood,
+    penalties,
+)
+from gridsec.estimators.modal.laterals import GAIN, OneAmount
 from gridsec.estimators.modal.search import ALIKE, DOUBT, Identification, costs_of, identified
 
 MISFIT = 0.1
 """Share of an explanation's evidence that steps and ramps leave open, 1."""
-ROUNDS, GAIN = 4, 1.0
+ROUNDS, WORTH = 4, 1.0
 """Largest number of amounts for which the relaxation is solved, and least gain of the cost by one more, 1."""
 ITERATIONS = 300
 """Largest number of iterations of the relaxation; most take below 100."""
 HALF = 0.5
 """Share from which on a meter is in the set of the relaxation, and at its start, 1."""
-LEAST = 1e-9
-"""Least change of the cost that counts, 1: rounding."""
 
 
 def weighed(found: Identification, masked: Bools, most: int) -> Identification:
@@ -83,14 +90,14 @@ def weighed(found: Identification, masked: Bools, most: int) -> Identification:
         accused = J[:p] & ~masked & (sign * amount[:p] > 0.0)
         if not any_of(accused & named):
             continue
-        own, without = _own(problem, J, accused, sign, masked)
+        own, without = _own(problem, J, accused, sign)
         each, other = min(_instead(problem, J, amount, accused, masked, most), key=lambda pair: pair[0])
         more = max(0.0, each - own)
         if more < max(least, MISFIT * (without - own)):
             contested |= accused & named
             key = other.tobytes()
             # No more than J: few meters are likelier than many.
-            cost = by_model[model][J.tobytes()] + max(more, LEAST)
+            cost = by_model[model][J.tobytes()] + max(more, GAIN)
             by_model[model][key] = min(cost, by_model[model].get(key, inf))
     if not any_of(contested):
         return found
@@ -98,38 +105,42 @@ def weighed(found: Identification, masked: Bools, most: int) -> Identification:
     return replace(out, named=out.named & ~contested)
 
 
-def _own(problem: SearchProblem, J: Bools, accused: Bools, sign: float, masked: Bools) -> tuple[float, float]:
+def _own(problem: SearchProblem, J: Bools, accused: Bools, sign: float) -> tuple[float, float]:
     """L of the explanation, with one amount of the meters accused where that is less, and without them."""
-    rest = J.copy()
-    rest[: problem.meters] &= ~accused
+    rest = _without(J, accused)
     whole, without = _evidence(problem, np.stack([J, rest])).tolist()
-    one = _relaxed(problem, rest, ~accused, sign, masked)
-    every = np.ones((1, one.at.size))
-    alike = one.costs(every @ one.y, ((every @ one.F) * every).sum(axis=1))
-    return min(whole, without + float(alike[0])), without
+    at, y, F = _beside(problem, rest, accused)
+    alike = _OneSign(sign * y, F, float(problem.std[0]) ** 2, np.ones(at.size, dtype=np.bool_)).cost
+    return min(whole, without + alike), without
 
 
 def _instead(  # noqa: PLR0917  # one explanation
     problem: SearchProblem, J: Bools, amount: Floats, accused: Bools, masked: Bools, most: int
 ) -> Iterator[tuple[float, Bools]]:
     """L of sets without the meters accused, (p,), and the sets, (q,)."""
-    p, rest = problem.meters, J.copy()
-    rest[:p] &= ~accused
+    p, rest = problem.meters, _without(J, accused)
     size = float(np.abs(amount[:p][accused]).mean())
     kept = [rest]
     for sign in (1.0, -1.0):
-        without = rest.copy()
-        without[:p] &= ~(sign * amount[:p] > 0.0)
-        for each in (rest,) if np.array_equal(without, rest) else (rest, without):
-            one = _relaxed(problem, each, accused, sign, masked)
+        fewer = _without(rest, sign * amount[:p] > 0.0)
+        for each in (rest,) if np.array_equal(fewer, rest) else (rest, fewer):
+            at, y, F = _beside(problem, each, ~(each[:p] | accused))
             room = most - int(np.count_nonzero(each[:p] | masked))
-            cost, inside = one.best(size, room)
+            one = _Relaxed(sign * y, F, float(problem.std[0]) ** 2, ~masked[at], room)
+            cost, inside = one.best(size)
             if any_of(inside):
                 both = each.copy()
-                both[one.at[inside]] = True
+                both[at[inside]] = True
                 yield float(_evidence(problem, each[None])[0]) + cost, both
                 kept.append(both)
     yield from zip(_evidence(problem, np.stack(kept)).tolist(), kept, strict=True)
+
+
+def _without(chosen: Bools, meters: Bools) -> Bools:
+    """The set (q,) without some meters, (p,)."""
+    out = chosen.copy()
+    out[: meters.size] &= ~meters
+    return out
 
 
 def _evidence(problem: SearchProblem, sets: Bools) -> Floats:
@@ -138,22 +149,38 @@ def _evidence(problem: SearchProblem, sets: Bools) -> Floats:
     out = costs(problem, sets)
     several = np.flatnonzero(count > 1)
     if several.size:
-        alike = costs(problem, sets[several], ALIKE)
-        out[several] = -2.0 * (np.logaddexp(-0.5 * out[several], -0.5 * alike) - log(2.0))
+        out[several] = mean_likelihood(np.stack([out[several], costs(problem, sets[several], ALIKE)]))
     return np.asarray(out - penalties(problem.meters)[count])
 
 
-def _relaxed(problem: SearchProblem, own: Bools, barred: Bools, sign: float, masked: Bools) -> _Relaxed:
-    """Sets of one amount of a sign, of meters that are neither in `own` (q,) nor `barred` (p,)."""
-    p = problem.meters
-    at, beside = np.flatnonzero(informed(problem) & ~own[:p] & ~barred), np.flatnonzero(own)
-    y, F = problem.y[at], problem.F[np.ix_(at, at)]
-    if beside.size:
-        A = problem.F[np.ix_(beside, beside)] + np.diag(problem.std[beside] ** -2.0)
-        cross = problem.F[np.ix_(beside, at)]
-        gain = np.linalg.solve(A, cross).T
-        y, F = y - gain @ problem.y[beside], F - gain @ cross
-    return _Relaxed(at, ~masked[at], sign * y, F, float(problem.std[0]) ** 2)
+def _beside(problem: SearchProblem, own: Bools, meters: Bools) -> tuple[Ints, Floats, Floats]:
+    """Some meters (p,) with readings, their scores (k,) and information (k, k), for any amounts of `own`."""
+    at, A = np.flatnonzero(informed(problem) & meters), Tableau(problem).pivot(own).A
+    F = submatrix(A, at, at)
+    F[np.diag_indices(at.size)] -= problem.std[at] ** -2.0
+    return at, A[at, -1], F
+
+
+class _OneSign(OneAmount):
+    """Sets with one amount of a sign: an amount of the other sign gains nothing."""
+
+    def fit(self, a: Floats, b: Floats) -> Floats:
+        """Fits of sets with scores a and information b."""
+        return super().fit(np.maximum(a, 0.0), b)
+
+
+class _Limited(_OneSign):
+    """Sets of at least one meter, and at most `room` of those that count, (k,)."""
+
+    def __init__(self, relaxed: _Relaxed, inside: Bools) -> None:
+        super().__init__(relaxed.y, relaxed.F, relaxed.s2, inside)
+        self.counted, self.room = relaxed.counted, relaxed.room
+
+    def toggled(self) -> Floats:
+        """Cost after toggling each meter, (k,)."""
+        sign, fit = self.moved()
+        counted = int(np.count_nonzero(self.inside & self.counted)) + sign * self.counted
+        return np.where((self.count + sign > 0) & (counted <= self.room), fit, inf)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,47 +189,51 @@ class _Relaxed:
 
     Attributes
     ----------
-    at : (k,)
-        The meters.
-    counted : (k,)
-        Those that count in the size of a set.
     y, F : (k,), (k, k)
-        Their scores, for an amount of the sign, and information for any amounts of the faults.
+        Scores of the meters, for an amount of the sign, and their information, for any amounts of the faults.
     s2
         Prior variance of the amount.
+    counted : (k,)
+        Meters that count in the size of a set.
+    room
+        Largest number of these.
     """
 
-    at: Ints
-    counted: Bools
     y: Floats
     F: Floats
     s2: float
+    counted: Bools
+    room: int
 
-    def best(self, amount: float, room: int) -> tuple[float, Bools]:
-        """Least cost of one amount, at most 0, and its set, (k,); at most `room` counted meters."""
-        least, best = 0.0, np.zeros(self.at.size, dtype=np.bool_)
-        if not best.size or room <= 0:
+    def best(self, amount: float) -> tuple[float, Bools]:
+        """Least fit of one amount, at most 0, and its set, (k,)."""
+        least, best = 0.0, np.zeros(self.y.size, dtype=np.bool_)
+        if not best.size or self.room <= 0:
             return least, best
-        start = np.full(self.at.size, HALF)
+        start = np.full(best.size, HALF)
         for _ in range(ROUNDS):
             share, before = self._share(amount, start), least
-            order = np.argsort(-share, kind="stable")
-            order = order[np.cumsum(self.counted[order]) <= room]
-            nested = self.costs(
-                np.cumsum(self.y[order]), np.cumsum(np.cumsum(self.F[np.ix_(order, order)], 0), 1).diagonal()
-            )
-            for k in {int(nested.argmin()), max(1, int((share[order] > HALF).sum())) - 1, order.size - 1}:
-                inside = np.zeros(self.at.size, dtype=np.bool_)
-                inside[order[: k + 1]] = True
-                cost, inside = self._improved(float(nested[k]), inside, room)
-                if cost < least:
-                    least, best = cost, inside
-            rows = self.F @ best
-            now = float(self.y @ best) / (float(rows @ best) + 1.0 / self.s2)
-            if not (least < before - GAIN and now > 0.0):
+            for inside in self._rounded(share):
+                end = _Limited(self, inside).descend()
+                if end.cost < least:
+                    least, best, now = end.cost, end.inside, end.a / (end.b + 1.0 / self.s2)
+            if not (least < before - WORTH and now > 0.0):
                 break
             start, amount = np.clip(share * amount / now, 0.0, 1.0), now
         return least, best
+
+    def _rounded(self, share: Floats) -> Iterator[Bools]:
+        """Beginnings of the order by the shares: the best one, the larger half, and the longest."""
+        order = np.argsort(-share, kind="stable")
+        order = order[np.cumsum(self.counted[order]) <= self.room]
+        F = submatrix(self.F, order, order)
+        one = _OneSign(self.y, self.F, self.s2, np.zeros(share.size, dtype=np.bool_))
+        nested = one.fit(np.cumsum(self.y[order]), np.cumsum(np.cumsum(F, 0), 1).diagonal())
+        half = max(1, int((share[order] > HALF).sum()))
+        for k in {int(nested.argmin()) + 1, half, order.size}:
+            inside = np.zeros(share.size, dtype=np.bool_)
+            inside[order[:k]] = True
+            yield inside
 
     def _share(self, amount: float, start: Floats) -> Floats:
         """Solution of the relaxation, (k,)."""
@@ -217,24 +248,3 @@ class _Relaxed:
             cost, start, jac=True, bounds=bounds, method="L-BFGS-B", options={"maxiter": ITERATIONS}
         )
         return np.asarray(found.x)
-
-    def costs(self, a: Floats, b: Floats) -> Floats:
-        """Cost of one amount with scores a and information b; an amount of the other sign gains nothing."""
-        a, b = np.maximum(a, 0.0), np.maximum(b, 0.0)
-        return np.asarray(np.log1p(self.s2 * b) - a * a / (b + 1.0 / self.s2))
-
-    def _improved(self, cost: float, inside: Bools, room: int) -> tuple[float, Bools]:
-        """Descent by single meters."""
-        for _ in range(4 * inside.size):
-            sign, rows = np.where(inside, -1.0, 1.0), self.F @ inside
-            count = int(np.count_nonzero(inside & self.counted)) + sign * self.counted
-            some = np.count_nonzero(inside) + sign > 0
-            b = float(rows @ inside) + 2.0 * sign * rows + self.F.diagonal()
-            each = self.costs(float(self.y @ inside) + sign * self.y, b)
-            each = np.where(some & (count <= room), each, inf)
-            j = int(each.argmin())
-            if not each[j] < cost - LEAST:
-                break
-            inside[j] = not inside[j]
-            cost = float(each[j])
-        return cost, inside

@@ -153,6 +153,11 @@ def costs(problem: SearchProblem, sets: Bools, share: float = 0.0) -> Floats:
     return np.asarray(out)
 
 
+def mean_likelihood(each: Floats) -> Floats:
+    """Costs of the mean of the likelihoods, (...); `each` has the costs of one likelihood per row."""
+    return np.asarray(-2.0 * (np.logaddexp.reduce(-0.5 * each, axis=0) - log(len(each))))
+
+
 def _among(problem: SearchProblem, used: Bools) -> SearchProblem:
     """The problem with some faults (q,) only."""
     at = np.flatnonzero(used)

@@ -8,7 +8,7 @@ every group is a beginning.
 `coded`, if that is less than that of its number of meters.
 
 **One amount.** Meters that are off by nearly one amount need one size instead of k. A descent by independent
-amounts does not find them: one amount at a time, none is worth its penalty. `Common` descends with one
+amounts does not find them: one amount at a time, none is worth its penalty. `OneAmount` descends with one
 amount for all, from the best set and from the laterals with the best fit. A change by one meter costs O(1).
 """
 
@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 from math import inf, log
+from typing import Self
 
 import numpy as np
 from scipy.cluster.hierarchy import linkage
@@ -77,14 +78,76 @@ def _log_binomials(p: int) -> Floats:
         )
 
 
-class Common:
+class OneAmount:
+    """A set of meters with one amount, and the fits of all sets near it.
+
+    The score and the information of the amount are ``a = 1' y_J`` and ``b = 1' F_JJ 1``:
+
+        fit(J) = -a^2 / (b + 1 / s^2) + log(1 + s^2 b)
+
+    Parameters
+    ----------
+    y, F : (k,), (k, k)
+        Scores and information of the meters.
+    s2
+        Prior variance s^2 of the amount.
+    inside : (k,)
+        The set.
+    """
+
+    def __init__(self, y: Floats, F: Floats, s2: float, inside: Bools) -> None:
+        self.y, self.F, self.s2, self.inside = y, F, s2, inside.copy()
+        self.rows = F @ self.inside
+        self.a, self.b = float(y @ self.inside), float(self.rows @ self.inside)
+        self.count = int(self.inside.sum())
+
+    def fit(self, a: Floats, b: Floats) -> Floats:
+        """Fits of sets with scores a and information b."""
+        b = np.maximum(b, 0.0)
+        return np.asarray(np.log1p(self.s2 * b) - a * a / (b + 1.0 / self.s2))
+
+    def moved(self) -> tuple[Ints, Floats]:
+        """Change of the number by toggling each meter, 1 or -1, and the fit after it, (k,)."""
+        sign = np.where(self.inside, -1, 1)
+        b = self.b + 2.0 * sign * self.rows + self.F.diagonal()
+        return sign, self.fit(self.a + sign * self.y, b)
+
+    @property
+    def cost(self) -> float:
+        """Cost of the set."""
+        return float(self.fit(np.array([self.a]), np.array([self.b]))[0])
+
+    def toggled(self) -> Floats:
+        """Cost after toggling each meter, (k,)."""
+        return self.moved()[1]
+
+    def descend(self) -> Self:
+        """Lower the cost by single meters until none of them helps."""
+        cost = self.cost
+        for _ in range(4 * self.inside.size):
+            one = self.toggled()
+            j = int(one.argmin())
+            if not one[j] < cost - GAIN:
+                break
+            self.toggle(j)
+            cost = float(one[j])
+        return self
+
+    def toggle(self, j: int) -> None:
+        """Add a meter, or remove it."""
+        sign = -1.0 if self.inside[j] else 1.0
+        self.a += sign * float(self.y[j])
+        self.b += 2.0 * sign * float(self.rows[j]) + float(self.F[j, j])
+        self.rows += sign * self.F[j]
+        self.count += int(sign)
+        self.inside[j] = not self.inside[j]
+
+
+class Common(OneAmount):
     """A lateral with exceptions that is off by one amount, and the costs of all sets near it.
 
-    The scores and the information of the one amount are ``a = 1' y_J`` and ``b = 1' F_JJ 1``:
-
-        cost(J) = -a^2 / (b + 1 / s^2) + log(1 + s^2 b) + penalty(J)
-
-    with the penalty of `coded` for this lateral, or that of the number of meters.
+    The cost is the fit with the penalty of `coded` for this lateral, without that of its choice, or with that
+    of the number of meters.
 
     Parameters
     ----------
@@ -98,59 +161,38 @@ class Common:
 
     def __init__(self, problem: SearchProblem, lateral: Bools, inside: Bools) -> None:
         p = problem.meters
-        self.y, self.F, self.s2 = problem.y[:p], problem.F[:p, :p], float(problem.std[0]) ** 2
-        self.penalty, self.lateral, self.inside = penalties(p), lateral, inside.copy()
+        super().__init__(problem.y[:p], problem.F[:p, :p], float(problem.std[0]) ** 2, inside)
+        self.penalty, self.lateral = penalties(p), lateral
         self.size, self.choices = int(lateral.sum()), _log_binomials(p)
         self.read = informed(problem)
         self.others = int(np.count_nonzero(self.read & ~lateral))
-        self.rows = self.F @ self.inside
-        self.a, self.b = float(self.y @ self.inside), float(self.rows @ self.inside)
-        self.count = int(self.inside.sum())
         self.kept = int(np.count_nonzero(self.inside & lateral))
 
-    def _costs(self, a: Floats, b: Floats, count: Ints, kept: Ints) -> Floats:
-        b = np.maximum(b, 0.0)
-        out = -a * a / (b + 1.0 / self.s2) + np.log1p(self.s2 * b)
+    def _charged(self, fit: Floats, count: Ints, kept: Ints) -> Floats:
+        """Costs of sets by their fits, numbers of meters, and numbers of those of the lateral."""
         if self.size:
             left, other = self.choices[self.size], self.choices[self.others]
-            out += 2.0 * (left[self.size - kept] + other[count - kept])
+            out = fit + 2.0 * (left[self.size - kept] + other[count - kept])
         else:
-            out += self.penalty[count]
+            out = fit + self.penalty[count]
         return np.where(count > 0, out, inf)
 
     @property
     def cost(self) -> float:
         """Cost of the set, without that of the choice of the lateral."""
-        each = np.array([self.a]), np.array([self.b]), np.array([self.count]), np.array([self.kept])
-        return float(self._costs(*each)[0])
+        each = np.array([super().cost]), np.array([self.count]), np.array([self.kept])
+        return float(self._charged(*each)[0])
 
     def toggled(self) -> Floats:
         """Cost after toggling each meter, (p,)."""
-        sign = np.where(self.inside, -1, 1)
-        b = self.b + 2.0 * sign * self.rows + self.F.diagonal()
-        out = self._costs(self.a + sign * self.y, b, self.count + sign, self.kept + sign * self.lateral)
+        sign, fit = self.moved()
+        out = self._charged(fit, self.count + sign, self.kept + sign * self.lateral)
         return np.where(self.read, out, inf)
 
-    def descend(self) -> Common:
-        """Lower the cost by single meters until none of them helps."""
-        cost = self.cost
-        for _ in range(4 * self.inside.size):
-            one = self.toggled()
-            j = int(one.argmin())
-            if not one[j] < cost - GAIN:
-                break
-            self._toggle(j)
-            cost = float(one[j])
-        return self
-
-    def _toggle(self, j: int) -> None:
-        sign = -1.0 if self.inside[j] else 1.0
-        self.a += sign * float(self.y[j])
-        self.b += 2.0 * sign * float(self.rows[j]) + float(self.F[j, j])
-        self.rows += sign * self.F[j]
-        self.count += int(sign)
-        self.kept += int(sign * self.lateral[j])
-        self.inside[j] = not self.inside[j]
+    def toggle(self, j: int) -> None:
+        """Add a meter, or remove it."""
+        self.kept += int(self.lateral[j]) * (-1 if self.inside[j] else 1)
+        super().toggle(j)
 
 
 def in_common(problem: SearchProblem, laterals: Floats, best: Bools) -> Bools:

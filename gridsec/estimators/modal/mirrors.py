@@ -22,14 +22,14 @@ doubt all others of its phase.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Ints, any_of, submatrix
-from gridsec.estimators.modal.costs import SearchProblem, informed
+from gridsec.estimators.modal.costs import SearchProblem, informed, mean_likelihood
 from gridsec.estimators.modal.laterals import clusters, coded
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.search import ALIKE, Identification, costs_of, identified
@@ -149,23 +149,21 @@ class _Likelihood:
         least = min(shares.values())
         # A prior that is far worse for the set is so for its images.
         self.shares = [share for share, one in shares.items() if one <= least + APART]
-        self.own = _mean(shares[share] for share in self.shares)
+        self.own = self._mean(shares)
 
     def __call__(self, rest: Bools, column: Bools) -> float:
         """L of the faults `rest` (q,) and of the meters `column` (p,) with one amount."""
-        return _mean(self._with(rest, column, share) for share in self.shares)
+        return self._mean({share: self._with(rest, column, share) for share in self.shares})
+
+    def _mean(self, each: Mapping[float, float]) -> float:
+        """L of the mean of the likelihoods with the priors that count."""
+        return float(mean_likelihood(np.array([each[share] for share in self.shares])))
 
     def _with(self, rest: Bools, column: Bools | None, share: float) -> float:
         at = np.flatnonzero(rest)
         if np.count_nonzero(at < self.problem.meters) < 2:
             share = 0.0
         return _likelihood(self.problem, at, column, share) + (self.charge if share else 0.0)
-
-
-def _mean(each: Iterable[float]) -> float:
-    """L of the mean of the likelihoods."""
-    half = -0.5 * np.fromiter(each, np.float64)
-    return -2.0 * float(np.logaddexp.reduce(half) - np.log(half.size))
 
 
 def _likelihood(problem: SearchProblem, at: Ints, column: Bools | None, share: float = 0.0) -> float:

@@ -98,7 +98,7 @@ def _bounded(  # noqa: PLR0917  # the filter, and the two enlargements
     T = np.vstack([-g_w, modes.directions - g_b])
     rest, bound = P - T @ known.cov @ T.T, T @ now.cov @ T.T - P
     cov = (1.0 + more) * np.stack([rest[w, w], rest[w, b], rest[b, b]])
-    cov[0] += prior * modes.loads
+    cov[0] += prior * modes.varying
     cov[2] += prior * modes.lasting
     if prior == 1.0:
         cov = np.stack([modes.varying, np.zeros(t), modes.lasting])
@@ -230,7 +230,7 @@ def _problems(modes: Modes, arrays: Mapping[str, Floats], names: list[str]) -> l
         return [Problem("not-finite", f"{name} is no number") for name in finite]
     var_w, cov_wb, var_b = (arrays[_PREFIX + name] for name in ("var_w", "cov_wb", "var_b"))
     rules: tuple[tuple[str, Bools], ...] = (
-        ("var_w", (var_w >= 0.0) & (var_w <= WIDEST * modes.loads)),
+        ("var_w", (var_w >= 0.0) & (var_w <= WIDEST * modes.varying)),
         ("var_b", (var_b > 0.0) & (var_b <= WIDEST * modes.lasting)),
         ("cov_wb", cov_wb * cov_wb <= TOLERANCE * var_w * var_b),
         ("information", arrays[_PREFIX + "information"] >= 0.0),

@@ -40,6 +40,7 @@ from gridsec.estimators.modal.costs import (
     amounts,
     costs,
     informed,
+    mean_likelihood,
 )
 from gridsec.estimators.modal.laterals import GAIN, Groups, excess, filled, in_common, similar, together
 
@@ -290,10 +291,10 @@ def _with_amounts_alike(problem: SearchProblem, found: dict[bytes, float], more:
     sets = np.stack([np.frombuffer(key, dtype=np.bool_) for key in keys])
     several = np.flatnonzero(np.count_nonzero(sets[:, : problem.meters], axis=1) > 1)
     if several.size:
-        for k, other in zip(several, costs(problem, sets[several], ALIKE), strict=True):
-            # Twice the logarithm of the mean of both likelihoods.
-            both = np.logaddexp(-0.5 * found[keys[k]], -0.5 * other)
-            found[keys[k]] = 2.0 * (log(2.0) - float(both))
+        own = np.array([found[keys[k]] for k in several])
+        both = mean_likelihood(np.stack([own, costs(problem, sets[several], ALIKE)]))
+        for k, cost in zip(several, both.tolist(), strict=True):
+            found[keys[k]] = cost
 
 
 def _best(starts: tuple[Tableau, ...], groups: Groups) -> Tableau:

@@ -212,7 +212,8 @@ def _together(problem: LikelihoodProblem, start: SnapshotHypothesis) -> list[tup
     by each other customer.
     """
     p = problem.size
-    rows = np.concatenate([np.vstack([problem.error(c), problem.columns(c)]) for c in range(p)])
+    meters = problem.prior.size * np.eye(p)
+    rows = np.concatenate([np.vstack([meters[c], problem.columns(c)]) for c in range(p)])
     white = rows @ problem.W.T
     G, h = white @ white.T + np.eye(3 * p), white @ (problem.W @ start.m)
 

@@ -259,12 +259,6 @@ class LikelihoodProblem:
         (a, b), (_, d) = M.tolist()
         return [a, b, d], own.tolist(), (B @ at.g).tolist()
 
-    def error(self, c: int) -> Floats:
-        """Effect of a manipulated meter times A, (p,)."""
-        out = np.zeros(self.size)
-        out[c] = self.prior.size
-        return out
-
     def columns(self, c: int) -> Floats:
         """B of a customer, a row for each power, (2, p)."""
         if self.false is None:

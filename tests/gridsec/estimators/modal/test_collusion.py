@@ -69,13 +69,14 @@ def test_the_set_with_one_amount_is_the_best_of_all(seed: int) -> None:
     """Against all subsets of the other meters with an amount of the sign that was asked for."""
     given, room = street(0.8 * some(0, 1, 2, 3).astype(np.float64), seed), 4
     own, barred = np.append(some(7), False), some(11)
-    found = collusion._relaxed(given, own, barred, 1.0, NONE)
-    least, inside = found.best(0.5, room)
-    assert set(found.at.tolist()) == set(range(METERS)) - {7, 11}
+    at, y, F = collusion._beside(given, own, ~(own[:METERS] | barred))
+    found = collusion._Relaxed(y, F, 1.0, np.ones(at.size, dtype=np.bool_), room)
+    least, inside = found.best(0.5)
+    assert set(at.tolist()) == set(range(METERS)) - {7, 11}
 
     def exact(members: Bools) -> float:
         column = np.zeros(METERS + 1)
-        column[found.at[members]] = 1.0
+        column[at[members]] = 1.0
         W = np.stack([own.astype(np.float64), column], axis=1)
         F, y = W.T @ given.F @ W, W.T @ given.y
         if np.linalg.solve(np.eye(2) + F, y)[1] < 0.0:
