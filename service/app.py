@@ -91,7 +91,15 @@ async def serve(
         runtime = Runtime(
             config, store, sites.values(), given=given, unloaded=unloaded, wall=wall, settled=settled
         )
-        bus = bus_of(settings, shares, runtime.deliver, missed=partial(missed, store), wall=wall)
+        bus = bus_of(
+            settings,
+            shares,
+            runtime.deliver,
+            missed=partial(missed, store),
+            wall=wall,
+            count=runtime.count,
+            expects=runtime.expects,
+        )
         runtime.attach(stack.enter_context(bus))
         await http.serve(stack, runtime, tuple(sites), announce=announce, signals=signals, stopping=stopping)
 
@@ -119,6 +127,8 @@ def bus_of(
     missed: Callable[[str, int, int], Iterable[StoredEvent]] | None,
     wall: Callable[[], float],
     everything: bool = True,
+    count: Callable[[str, int], object] = lambda *_: None,
+    expects: Callable[[str], bool] = lambda _: False,
 ) -> Bus:
     """Return the zenoh session of a process; the parameters are those of `Bus`."""
     config = BusConfig(
@@ -138,6 +148,8 @@ def bus_of(
         wall=wall,
         missed=missed,
         everything=everything,
+        count=count,
+        expects=expects,
     )
 
 

@@ -309,7 +309,16 @@ async def work(
             acts=member.acts,
         )
         runtime = Runtime(config, store, (), given=(), wall=wall, settled=settled)
-        bus = bus_of(settings, shares, runtime.deliver, missed=None, wall=wall, everything=False)
+        bus = bus_of(
+            settings,
+            shares,
+            runtime.deliver,
+            missed=None,
+            wall=wall,
+            everything=False,
+            count=runtime.count,
+            expects=runtime.expects,
+        )
         stack.enter_context(bus)
         runtime.attach(bus)
         loop = asyncio.get_running_loop()

@@ -27,6 +27,7 @@ import structlog
 
 from feeders.model.site import Site
 from gridsec.errors import GridsecError
+from gridsec.interface import Cause
 from service.access.signing import MeterKeys
 from service.alarms.incidents import IncidentEvent, event_json
 from service.alarms.state_machine import (
@@ -271,6 +272,7 @@ class Engine:
         self._wakes: dict[str, float] = {}
         self._until = self._order_kept = -math.inf
         self.load = LoadControl(clock, lambda name: bool(self.metrics.active(name)))
+        self.metrics.shed.set_function(self.shed_displayed)
         self._clock, self._orphans = clock, Orphans()
         for site in sites:
             self.add(site)
@@ -459,6 +461,10 @@ class Engine:
             if self.committer.publisher is not None and name not in self.monitors:
                 self.committer.publisher.withdraw(name)
 
+    def expects(self, key: str) -> bool:
+        """True for a zenoh key of single readings of a monitored meter."""
+        return self._wire.expects(key)
+
     def _learn(self, known: Mapping[str, Known]) -> None:
         """Decode readings of these feeders from now on."""
         self._wire = Wire(known, self.config.prefix, self.config.max_payload, self.config.meter_keys)
@@ -558,9 +564,13 @@ class Engine:
                 continue
             self.metrics.count_passed_over(name, monitor.set_shed(name in shed, self._wall()))
             self._set_wake(monitor)
-        self.metrics.shed.set(len(shed))
         told = {"feeders": len(shed), "changed": changed[:SHOWN], **self.load.figures()}
         _log.warning("feeders are shed because of overload", **told)
+
+    def shed_displayed(self) -> int:
+        """Number of feeders that are displayed as not monitored because of overload, as in their list."""
+        latest = (monitor.latest for monitor in self.monitors.values())
+        return sum(one is not None and one.summary["cause"] is Cause.OVERLOAD for one in latest)
 
     def _reach(self, now: float, waiting: Mapping[str, float]) -> None:
         """Add the ticks that are due at the wall time `now`, Unix s, to the pending ones.

@@ -25,7 +25,7 @@ LASTING = 3
 """Consecutive windows of overload before feeders are shed."""
 LONG_ROUND_S = 0.5
 """Duration of a round, s, that is a sign of overload: ticks of 1 s are late by half a tick."""
-HOLD_S, HOLD_MAX_S = 1.0, 8.0
+HOLD_S, HOLD_MAX_S = 1.0, 4.0
 """First and longest time from an overload to the return of feeders, s; it doubles at each new overload."""
 CALM_S = 60.0
 """Time without overload after which the first hold applies again, s."""

@@ -102,6 +102,9 @@ class Network(Publisher, Protocol):
     def unfollow(self, feeder: str) -> None:
         """End the effect of `follow`; idempotent."""
 
+    def discard(self, feeders: Collection[str]) -> None:
+        """Count the readings of exactly these followed feeders, instead of delivering them."""
+
 
 class Runtime:
     """The running service; backend of the API.
@@ -185,6 +188,21 @@ class Runtime:
         self._dropped += dropped
         return dropped
 
+    def count(self, feeder: str, number: int) -> None:
+        """Count samples of a feeder that the receiving thread does not deliver.
+
+        They are discarded if the feeder is shed, and dropped otherwise.
+        """
+        self._inbox.count(feeder, number)
+        self._engine.metrics.samples.inc(number)
+        if feeder not in self._inbox.shed:
+            self._engine.metrics.dropped.inc(number)
+            self._dropped += number
+
+    def expects(self, key: str) -> bool:
+        """True for a zenoh key of single readings of a monitored meter."""
+        return self._engine.expects(key)
+
     async def run(self) -> None:
         """Run rounds until `stop`.
 
@@ -222,9 +240,12 @@ class Runtime:
             self._writer.shutdown(wait=False)
 
     def _follow(self) -> None:
-        """Subscribe to the readings of exactly the monitored feeders."""
+        """Subscribe to the readings of exactly the monitored feeders; those of shed ones are counted only."""
         monitored = self._engine.monitors
-        if self._bus is None or monitored is self._followed:
+        if self._bus is None:
+            return
+        self._bus.discard(self._inbox.shed)
+        if monitored is self._followed:
             return
         for name in self._followed.keys() - monitored.keys():
             self._bus.unfollow(name)
@@ -516,7 +537,7 @@ class Runtime:
             told, waits = monitor.latest, engine.config.clock is Clock.WALL
             if waits and told is not None and monitor.stale(age := self.age(told)):
                 problems.append(f"feeder {monitor.name}: the latest report is {age:.0f} s old")
-        if shed := len(self._inbox.shed):
+        if shed := engine.shed_displayed():
             problems.append(f"overload: {shed} of {len(engine.monitors)} feeders are not monitored")
         for name, problem in engine.unloaded.copy().items():
             problems.append(f"feeder {name}: {problem}")

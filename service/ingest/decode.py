@@ -92,6 +92,11 @@ class Wire:
     # Feeder and source of single JSON readings so far, by zenoh key and encoding.
     places: dict[tuple[str, str], tuple[str, int]] = field(default_factory=dict)
 
+    def expects(self, key: str) -> bool:
+        """True for the key of single readings of a known meter."""
+        source = source_of(key, self.prefix, self.known)
+        return isinstance(source, Source) and source.concentrator is None
+
     def decode(
         self,
         key: str,

@@ -173,6 +173,11 @@ class Inbox:
         with self._room:
             return {name: lane.offered for name, lane in self._lanes.items() if name is not None}
 
+    def count(self, feeder: str, number: int) -> None:
+        """Count samples of a feeder that are discarded before the queue."""
+        with self._room:
+            self._lanes.setdefault(feeder, _Lane()).offered += number
+
     def put(self, batch: list[Sample]) -> int:
         """Add samples; called from any thread. Returns the number of dropped ones beside the surplus."""
         dropped = 0

@@ -12,8 +12,10 @@ import json
 import re
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, islice
 from typing import Any, TypeAlias
@@ -48,6 +50,10 @@ stop the others.
 
 BATCH = 1024
 """Largest number of samples that are taken from one queue before the next one."""
+NEWEST = 4
+"""Number of the newest samples of a key that are taken from a queue with more than `BATCH`."""
+DECLARING_S = 0.005
+"""Time for declarations of keys after a look at the queues, s; one takes 0.05 to 0.5 ms."""
 _HEAD = 1024
 QUERIES_WAITING = 256
 _ESTIMATES = 1024
@@ -84,7 +90,7 @@ def _config(config: BusConfig) -> zenoh.Config:
         if config.listen:
             settings["listen/endpoints"] = [_buffered(endpoint) for endpoint in config.listen]
         if config.connect:
-            settings["connect/endpoints"] = list(config.connect)
+            settings["connect/endpoints"] = [_buffered(endpoint) for endpoint in config.connect]
         for key, value in settings.items():
             built.insert_json5(key, json.dumps(value))
     except (zenoh.ZError, OSError, ValueError) as error:
@@ -183,6 +189,17 @@ def tls_files(config: BusConfig) -> dict[str, str]:
 _Handler: TypeAlias = "zenoh.handlers.Handler[zenoh.Sample]"
 _Subscription: TypeAlias = "tuple[zenoh.Subscriber[Any], _Handler]"
 """A subscription and its queue, which remains readable after its end."""
+_Keyed: TypeAlias = "tuple[str, zenoh.Sample]"
+"""A sample and its key."""
+
+
+@dataclass(slots=True)
+class _Followed:
+    """Reception of one feeder."""
+
+    subscriber: zenoh.Subscriber[Any]
+    queue: _Handler
+    keys: dict[str, zenoh.KeyExpr | None] = field(default_factory=dict)  # None: still to be declared
 
 
 class Bus:
@@ -197,8 +214,14 @@ class Bus:
     missed: called with `alarm` or `incident`, a number and a limit; returns the stored events after the
         number, oldest first. A GridsecError that it raises is the reply. None: such queries get no reply.
     everything: receive the keys of all other feeders as well, to report them as bad readings.
+    count: called from the receiving threads with a feeder and the number of its samples that are not
+        delivered: all of a feeder of `discard`, and the older ones of a long queue.
 
-    Each followed feeder has a queue of its own: a flood on other keys displaces none of its samples.
+    expects: True for a key of single readings of a meter that is known; it is declared when it arrives.
+        zenoh compares other keys with the subscriptions of all feeders at each put.
+
+    Each followed feeder has a queue of its own: a flood on other keys displaces none of its samples. A look
+    at a queue empties it, so that samples become no older than the time between two looks.
     """
 
     def __init__(
@@ -212,10 +235,15 @@ class Bus:
         wall: Callable[[], float] = time.time,
         missed: Callable[[str, int, int], Iterable[StoredEvent]] | None = lambda *_: (),
         everything: bool = True,
+        count: Callable[[str, int], object] = lambda *_: None,
+        expects: Callable[[str], bool] = lambda _: False,
     ) -> None:
         self._wall, self._missed, self._everything = wall, missed, everything
         self._live: zenoh.Session | None = None
-        self._followed: dict[str, _Subscription] = {}
+        self._followed: dict[str, _Followed] = {}
+        self._discarded: Collection[str] = frozenset()
+        self._arrived: deque[tuple[str, _Followed, str]] = deque()  # keys to be declared
+        self._count, self._expects = count, expects
         self._others: _Subscription | None = None
         self._closing = threading.Event()
         self._config = config
@@ -290,12 +318,19 @@ class Bus:
         Samples that wait in the queue of all other keys at this moment are discarded.
         """
         if not self._lossless and feeder not in self._followed:
-            self._followed[feeder] = self._subscribe(self._session(), f"{feeder}/**")
+            self._followed[feeder] = _Followed(*self._subscribe(self._session(), f"{feeder}/**"))
 
     def unfollow(self, feeder: str) -> None:
         """End the effect of `follow`; idempotent."""
         if (made := self._followed.pop(feeder, None)) is not None:
-            made[0].undeclare()  # type: ignore[no-untyped-call]
+            made.subscriber.undeclare()  # type: ignore[no-untyped-call]
+            for key in made.keys.values():
+                if key is not None:
+                    self._session().undeclare(key)
+
+    def discard(self, feeders: Collection[str]) -> None:
+        """Count the samples of exactly these followed feeders from now on, instead of delivering them."""
+        self._discarded = feeders
 
     def _receive(self, handler: _Handler) -> None:
         """Deliver the samples of one subscription until it ends."""
@@ -304,33 +339,58 @@ class Bus:
                 first = handler.recv()
             except zenoh.ZError:  # the subscription is closed and drained
                 return
-            self._deliver(list(self._copies(_waiting(handler, BATCH, first), None)))
+            self._deliver(self._copies(self._readings(_waiting(handler, BATCH, first))))
 
     def _poll(self, closing: threading.Event) -> None:
-        """Deliver the samples of all subscriptions, `BATCH` of each in turn, until `closing` is set.
+        """Deliver the samples of all subscriptions in turn, until `closing` is set.
 
         Samples on patterns of keys are not counted: a flood of them would leave a feeder's own ones in its
         queue until they are displaced.
         """
         while not closing.wait(POLL_S):
             batch, begun = list[Sample](), time.monotonic()
-            for feeder, (_, handler) in list(self._followed.items()):
+            for feeder, followed in list(self._followed.items()):
                 if closing.is_set():
                     break
                 # Most of them are empty: the look is the cost.
-                if (first := _try_recv(handler)) is not None:
-                    batch += islice(self._copies(_waiting(handler, RING, first), feeder), BATCH)
+                if (first := _try_recv(followed.queue)) is not None:
+                    batch += self._take(feeder, followed, _waiting(followed.queue, RING, first))
                 # A flood in all queues makes the look last: the others must not wait for its end.
                 if batch and (len(batch) >= BATCH or time.monotonic() - begun > POLL_S):
                     self._deliver(batch)
                     batch, begun = [], time.monotonic()
             if self._others is not None:
-                batch += self._copies(_waiting(self._others[1], BATCH), None)
+                batch += self._copies(self._readings(_waiting(self._others[1], BATCH)))
             if batch:
                 self._deliver(batch)
+            self._declare(self._session())
 
-    def _copies(self, samples: Iterable[zenoh.Sample], feeder: str | None) -> Iterator[Sample]:
-        """Copies of the readings among some samples, with keys of one feeder, or None: of no followed one.
+    def _take(self, feeder: str, followed: _Followed, waiting: Iterable[zenoh.Sample]) -> list[Sample]:
+        """Copies of a feeder's waiting samples; the others are counted."""
+        if feeder in self._discarded:
+            self._count(feeder, sum(1 for _ in waiting))
+            return []
+        found = list(self._readings(waiting, feeder))
+        if len(found) > BATCH:
+            newest = _newest(found)
+            self._count(feeder, len(found) - len(newest))
+            found = newest
+        for key, _ in found:
+            if key not in followed.keys and self._expects(key):
+                followed.keys[key] = None
+                self._arrived.append((feeder, followed, key))
+        return self._copies(found)
+
+    def _declare(self, live: zenoh.Session) -> None:
+        """Declare keys that have arrived, within a time limit."""
+        end = time.monotonic() + DECLARING_S
+        while self._arrived and time.monotonic() < end:
+            feeder, followed, key = self._arrived.popleft()
+            if self._followed.get(feeder) is followed:
+                followed.keys[key] = live.declare_keyexpr(key)
+
+    def _readings(self, samples: Iterable[zenoh.Sample], feeder: str | None = None) -> Iterator[_Keyed]:
+        """Readings among some samples, with keys of one feeder, or None: of no followed one.
 
         A put on a pattern of keys is in the queues of all feeders that it matches.
         """
@@ -343,7 +403,10 @@ class Bus:
             if raw.kind == zenoh.SampleKind.DELETE:
                 self.counts.deleted += 1
             else:
-                yield self._copy(raw, key)
+                yield key, raw
+
+    def _copies(self, readings: Iterable[_Keyed]) -> list[Sample]:
+        return [self._copy(raw, key) for key, raw in readings]
 
     def _published_by_others(self, key: str) -> bool:
         """True for keys that another service with this prefix publishes."""
@@ -606,6 +669,19 @@ def _refuse(query: zenoh.Query, problem: str) -> None:
 def _waiting(handler: _Handler, most: int, *first: zenoh.Sample) -> Iterator[zenoh.Sample]:
     """Some samples and those that wait in a queue behind them, up to `most` together."""
     return islice(chain(first, iter(partial(_try_recv, handler), None)), most)
+
+
+def _newest(found: Sequence[_Keyed]) -> list[_Keyed]:
+    """The newest samples, `NEWEST` of each key and `BATCH` together, oldest first."""
+    counts: Counter[str] = Counter()
+    newest: list[_Keyed] = []
+    for one in reversed(found):
+        counts[one[0]] += 1
+        if counts[one[0]] <= NEWEST:
+            newest.append(one)
+        if len(newest) == BATCH:
+            break
+    return newest[::-1]
 
 
 def _try_recv(handler: _Handler) -> zenoh.Sample | None:

@@ -8,7 +8,7 @@ import random
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -70,6 +70,9 @@ class Outlet:
 
     def unfollow(self, feeder: str) -> None:
         self.followed.remove(feeder)
+
+    def discard(self, feeders: Collection[str]) -> None:
+        self.discarded = feeders
 
     def telemetry(self, key: str, payload: Value) -> None:
         assert key == f"{FEEDER}/estimate"
