@@ -548,7 +548,7 @@ class Engine:
 
         `dropped` is the number of samples that the queue has dropped since the last call.
         """
-        self.load.count_losses(dropped)
+        self.load.count_dropped(dropped)
         if self.load.update(inbox.offered):
             self.follow_load(inbox)
 
@@ -667,7 +667,7 @@ class Engine:
             result = self._guarded(monitor, monitor.judge)
             self.load.count_tick(monitor.name, time.thread_time() - begun)
             if monitor.skipped > skipped:
-                self.load.count_losses(monitor.skipped - skipped)
+                self.load.count_skipped(monitor.skipped - skipped)
                 self.metrics.skipped.labels(monitor.name).inc(monitor.skipped - skipped)
                 self._catch_up.skipped(monitor.name, monitor.skipped - skipped)
             if result is not None:

@@ -6,6 +6,11 @@ everything else in a round. capacity: part of the time in which no round waits f
 threads and processes have. Samples of a feeder that is not monitored are counted: its demand stays known. The
 time of its ticks is no part of c_s, c_t and factor: that of hundreds would make the others look expensive.
 
+The measured demand is the part of a window that its rounds last, times the ratio of needed to processed
+samples. Needed are the offered ones, but no more than `FLOOD` of each meter and tick: dropped ones beyond it
+change no verdict. Where it is above the sum of the model, all demands are scaled by the ratio: threads that
+compete for the interpreter's lock take more time than the model has of them.
+
 Under lasting overload whole feeders are shed until the demand of the others and of the ticks of the shed ones
 is `KEPT`. They return in parts while the demand fits.
 """
@@ -21,16 +26,16 @@ OVERLOADED = 0.9
 """Demand from which a window with losses or late rounds is one of overload."""
 KEPT = 0.7
 """Demand of the monitored feeders under overload: the rest is for the receiving thread and HTTP."""
-LASTING = 3
-"""Consecutive windows of overload before feeders are shed."""
+LASTING, LASTING_S = 2, 3.0
+"""Consecutive windows of overload, and their time, s, before feeders are shed."""
 LONG_ROUND_S = 0.5
 """Duration of a round, s, that is a sign of overload: ticks of 1 s are late by half a tick."""
-HOLD_S, HOLD_MAX_S = 1.0, 4.0
+HOLD_S, HOLD_MAX_S = 1.0, 3.0
 """First and longest time from an overload to the return of feeders, s; it doubles at each new overload."""
 CALM_S = 60.0
 """Time without overload after which the first hold applies again, s."""
 FLOOD = 2.0
-"""Samples of each meter and tick from which a feeder is shed before all others."""
+"""Samples of each meter and tick beyond which they are not needed, and a feeder is shed before all others."""
 RETURNING, RETURNING_MIN = 0.25, 8
 """Largest number of feeders that return in a window: a part of the monitored ones, and at least a number.
 
@@ -70,7 +75,8 @@ class Window:
     judged_s: float = 0.0  # that of ticks of monitored feeders, s
     shed_s: float = 0.0  # that of ticks of the others, s
     samples: int = 0  # processed samples
-    signs: int = 0  # lost samples, skipped ticks and long rounds
+    dropped: int = 0  # samples that the queues have dropped
+    late: int = 0  # skipped ticks and long rounds
 
 
 @dataclass
@@ -92,7 +98,7 @@ class LoadControl:
     _factor: float = 1.0
     _capacity: float = 1.0
     _shed_cost: float = 0.0  # processor time of the ticks of shed feeders, s for each second
-    _overloaded: int = 0
+    _overloaded: list[float] = field(default_factory=list)  # beginnings of consecutive windows of overload, s
     _hold_s: float = HOLD_S
     _last: float | None = None
     _returned: bool = False  # feeders have returned since the last overload
@@ -104,7 +110,7 @@ class LoadControl:
         window.rounds_s += rounds_s
         window.placed_s += placed_s
         window.samples += samples
-        window.signs += lasted_s > LONG_ROUND_S
+        window.late += lasted_s > LONG_ROUND_S
 
     def count_tick(self, feeder: str, spent_s: float) -> None:
         """Add the processor time of a tick, s; the first one of a feeder does not count in its cost."""
@@ -123,9 +129,13 @@ class LoadControl:
         if load.begun:
             load.spent_s += spent_s
 
-    def count_losses(self, number: int) -> None:
-        """Add samples or ticks that are lost by overload."""
-        self._now().signs += number
+    def count_skipped(self, number: int) -> None:
+        """Add skipped ticks."""
+        self._now().late += number
+
+    def count_dropped(self, number: int) -> None:
+        """Add samples that the queues have dropped."""
+        self._now().dropped += number
 
     def _now(self) -> Window:
         if self._window is None:
@@ -167,20 +177,30 @@ class LoadControl:
         before = set(self.shed)
         for name in before - self.feeders.keys():
             del self.shed[name]
-        kept = self._kept()
-        heavy = window.signs > 0 and max(kept, window.lasted_s / elapsed) > OVERLOADED
-        self._overloaded = self._overloaded + 1 if heavy else 0
-        if heavy:
+        model = self._kept()
+        missed = self._missed(window, elapsed)
+        kept = max(model, window.lasted_s / elapsed * missed)
+        scale = kept / model if model > 0.0 else 1.0
+        if (missed > 1.0 or window.late) and kept > OVERLOADED:
+            self._overloaded.append(window.begun)
             if self._last is not None and now - self._last < CALM_S and self._returned:
                 self._hold_s = min(HOLD_MAX_S, 2.0 * self._hold_s)
             self._last, self._returned = now, False
-            if self._overloaded >= LASTING:
-                self._shed_more(kept, now)
-        elif self.shed and self._last is not None and now - self._last >= self._hold_s:
-            self._take_back(kept)
+            if len(self._overloaded) >= LASTING and now - self._overloaded[0] >= LASTING_S:
+                self._shed_more(kept, scale, now)
+        else:
+            self._overloaded.clear()
+            if self.shed and self._last is not None and now - self._last >= self._hold_s:
+                self._take_back(kept, scale)
         if self._last is not None and now - self._last > CALM_S:
             self._hold_s = HOLD_S
         return set(self.shed) != before
+
+    def _missed(self, window: Window, elapsed: float) -> float:
+        """Ratio of the needed to the processed samples of a window; at least 1."""
+        monitored = (load for name, load in self.feeders.items() if name not in self.shed)
+        most = FLOOD * elapsed * sum(load.sources / load.tick_s for load in monitored)
+        return max(1.0, min(window.samples + window.dropped, most) / max(1, window.samples))
 
     def _measure(self, window: Window, elapsed: float, offered: Mapping[str, int]) -> None:
         if window.samples:
@@ -218,7 +238,7 @@ class LoadControl:
             if load is not None:
                 load.tick_cost_s += _SMOOTH * min(0.0, each * load.sources - load.tick_cost_s)
 
-    def _shed_more(self, kept: float, now: float) -> None:
+    def _shed_more(self, kept: float, scale: float, now: float) -> None:
         """Shed feeders: floods first, feeders with active alarms last. At least one stays."""
 
         def order(name: str) -> tuple[bool, bool, str]:
@@ -230,15 +250,17 @@ class LoadControl:
         for name in monitored[:-1]:
             if kept <= KEPT:
                 return
-            kept -= self.demand(name)
+            kept -= scale * self.demand(name)
             self.shed[name] = now
+            # The next windows measure the others.
+            self._overloaded.clear()
 
-    def _take_back(self, kept: float) -> None:
+    def _take_back(self, kept: float, scale: float) -> None:
         """Monitor feeders again while their demand fits, in place of their rare ticks."""
         each = self._shed_cost / self._capacity / len(self.shed)
         most = max(RETURNING_MIN, int(RETURNING * (len(self.feeders) - len(self.shed))))
         for name in list(self.shed)[:most]:
-            kept += self.demand(name) - each
+            kept += scale * (self.demand(name) - each)
             if kept > KEPT:
                 return
             del self.shed[name]

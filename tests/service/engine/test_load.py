@@ -55,7 +55,7 @@ class Machine:
         self.control.count_round(0.1, 0.1 * capacity, 0.0, 0)
         spent = done * capacity
         self.control.count_round(done, spent, spent, int(done / cost_s))
-        self.control.count_losses(int(work > 1.0))
+        self.control.count_dropped(round((work - done) / cost_s))
         self.control.update(lambda: self.offered)
 
 
@@ -89,7 +89,7 @@ def test_a_costly_start_of_all_feeders_does_not_keep_them_out() -> None:
         work = cost_s * (100 - len(machine.shed))
         machine.t += 1.0
         control.count_round(min(1.0, work), min(1.0, work), 0.0, 0)
-        control.count_losses(int(work > 1.0))
+        control.count_dropped(int(work > 1.0))
         control.update(lambda: machine.offered)
 
     for _ in range(5):
@@ -126,7 +126,7 @@ def test_ticks_of_shed_feeders_keep_no_feeder_out() -> None:
         samples = 340 - len(machine.shed)
         machine.t += 1.0
         control.count_round(min(1.0, work), min(1.0, work), 1e-4 * samples, samples)
-        control.count_losses(int(work > 1.0))
+        control.count_dropped(int(work > 1.0))
         control.update(lambda: machine.offered)
 
     for _ in range(8):
@@ -214,6 +214,45 @@ def test_short_rounds_that_wait_for_other_threads_keep_no_feeder_out() -> None:
     assert figures["demand"] == figures["demand_of_all"] < KEPT
 
 
+def test_time_that_the_model_does_not_explain_counts() -> None:
+    """Rounds that wait for the interpreter's lock last the whole second, at a tenth of the modelled work."""
+    machine = Machine(20)
+    control = machine.control
+
+    def second(dropped: int) -> None:
+        for name in machine.offered:
+            machine.offered[name] += 15
+        control.count_round(0.0, 0.0, 0.0, 0)
+        machine.t += 1.0
+        kept = 20 - len(machine.shed)
+        lasted = min(1.0, kept / 10)  # ten feeders take all the time
+        control.count_round(lasted, 0.005 * kept, 0.005 * kept, 15 * kept - dropped)
+        control.count_dropped(dropped)
+        control.update(lambda: machine.offered)
+
+    for _ in range(3):
+        second(150)
+    assert control.figures()["demand_of_all"] < KEPT
+    # Half of the needed samples were processed in all the time: the demand was 2.
+    before = len(machine.shed)
+    assert before in (13, 14)
+    for _ in range(10):
+        second(0)
+    assert before - 1 <= len(machine.shed) <= before
+
+
+def test_dropped_samples_that_no_tick_needs_are_no_overload() -> None:
+    machine = Machine(12)
+    for _ in range(10):
+        machine.second(330.0)
+    assert machine.shed  # all of the time is used, and half of the samples of a tick may be lost
+    machine = Machine(12)
+    for _ in range(10):
+        machine.second(330.0, cost_s=1e-4)
+        machine.control.count_dropped(5_000)
+    assert not machine.shed
+
+
 def test_kept_demand_leaves_room() -> None:
     machine = Machine(20)
     for _ in range(10):
@@ -257,6 +296,9 @@ def test_a_flood_displaces_only_its_own_samples() -> None:
     box.shed = frozenset({"calm"})
     assert box.put(quiet) == 0
     assert (len(box), box.offered()["calm"]) == (0, 200)
+    box.count("calm", 7)
+    box.count("new", 3)
+    assert (len(box), box.offered()["calm"], box.offered()["new"]) == (0, 207, 3)
 
 
 # --- engine --------------------------------------------------------------------------------------------
@@ -272,6 +314,7 @@ def test_a_shed_feeder_is_undecided_and_no_meter_is_silent(site: Site, tmp_path:
     wall = START + 0.0
     keys = [f"meter/{meter}" for meter in site.meter_ids] + ["substation"]
     box = Inbox(lambda: None, lossless=False, feeder_of=lambda key: key.split("/")[1])
+    shown = set[int]()
     with Store(f"sqlite:///{tmp_path / 's.db'}") as store:
         live = Engine(RuntimeConfig(), store, [site, other], wall=lambda: wall, stored=lambda: None)
         for monitor in live.monitors.values():
@@ -288,6 +331,11 @@ def test_a_shed_feeder_is_undecided_and_no_meter_is_silent(site: Site, tmp_path:
                 wall += 0.6
                 live.cycle([], box.oldest)
                 wall -= 0.6
+                # The metric states the feeders of the list, from the display on and until it ends.
+                latest = [monitor.latest for monitor in live.monitors.values()]
+                listed = sum(one is not None and one.summary["cause"] is Cause.OVERLOAD for one in latest)
+                assert f"gridsec_feeders_shed {float(listed)}" in live.metrics.exposition().decode()
+                shown.add(listed)
 
         def states() -> dict[str, Cause]:
             return {name: monitor.report.cause for name, monitor in live.monitors.items() if monitor.report}
@@ -311,3 +359,4 @@ def test_a_shed_feeder_is_undecided_and_no_meter_is_silent(site: Site, tmp_path:
         seconds(8)
         assert store.active() == []
         assert "gridsec_feeders_shed 0.0" in live.metrics.exposition().decode()
+        assert shown == {0, 1}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -18,7 +19,7 @@ import zenoh
 from service.alarms.state_machine import AlarmState, AlarmTransition, Change, to_json
 from service.ingest import queues, zenoh_bus
 from service.ingest.queues import BusConfig, BusUnavailable, Sample
-from service.ingest.zenoh_bus import BATCH, RING, Bus, MeterClient
+from service.ingest.zenoh_bus import BATCH, NEWEST, RING, Bus, MeterClient
 from service.store import Store
 from service.store.committer import alarm_key, missed
 from tests.codes import refused
@@ -42,7 +43,12 @@ class Sink:
 
 @contextmanager
 def pair(
-    sink: Sink, *, lossless: bool = False, max_payload: int = 10_000, slow: threading.Event | None = None
+    sink: Sink,
+    *,
+    lossless: bool = False,
+    max_payload: int = 10_000,
+    slow: threading.Event | None = None,
+    **options: Any,
 ) -> Iterator[tuple[Bus, MeterClient, str]]:
     """A bus and its meters; nothing is taken before the event `slow`."""
 
@@ -53,7 +59,9 @@ def pair(
 
     end = f"tcp/127.0.0.1:{free_port()}"
     with (
-        Bus(BusConfig(listen=(end,)), "gridsec", take, max_payload=max_payload, lossless=lossless) as bus,
+        Bus(
+            BusConfig(listen=(end,)), "gridsec", take, max_payload=max_payload, lossless=lossless, **options
+        ) as bus,
         MeterClient(BusConfig("client", connect=(end,)), "gridsec") as meters,
     ):
         yield bus, meters, end
@@ -190,20 +198,97 @@ def test_a_flood_on_a_pattern_of_keys_delays_no_sample_of_a_followed_feeder() ->
     assert len(looks) <= 2
 
 
+def test_samples_of_discarded_feeders_are_counted_and_not_delivered() -> None:
+    sink, counts = Sink(), Counter[str]()
+    with pair(sink, count=lambda feeder, number: counts.update({feeder: number})) as (bus, meters, _):
+        for feeder in ("calm", "shed"):
+            bus.follow(feeder)
+        bus.discard(frozenset({"shed"}))
+        for k in range(500):
+            for feeder in ("shed", "calm"):
+                meters.put(f"{feeder}/meter/a/reading", str(k).encode())
+        until(lambda: counts["shed"] == 500 and len(sink.samples) == 500)
+        assert {one.key for one in sink.samples} == {"gridsec/calm/meter/a/reading"}
+        bus.discard(frozenset())
+        meters.put("shed/meter/a/reading", b"again")
+        until(lambda: sink.samples[-1].payload == b"again")
+    assert counts == {"shed": 500}
+
+
+def test_of_a_long_queue_the_newest_samples_of_each_key_are_delivered() -> None:
+    sink, counts, slow = Sink(), Counter[str](), threading.Event()
+    with pair(sink, slow=slow, count=lambda feeder, number: counts.update({feeder: number})) as found:
+        bus, meters, _ = found
+        for feeder in ("first", "long"):
+            bus.follow(feeder)
+        # The receiving thread waits with the first sample, and the others in their queue.
+        meters.put("first/meter/a/reading", b"")
+        time.sleep(0.2)
+        for k in range(300):
+            for meter in range(5):
+                meters.put(f"long/meter/m{meter}/reading", str(k).encode())
+        for k in range(2):
+            meters.put("long/meter/rare/reading", str(k).encode())
+        time.sleep(0.2)
+        slow.set()
+        until(lambda: sink.samples and sink.samples[-1].key.endswith("/rare/reading"))
+    kept = [one for one in sink.samples if one.key.startswith("gridsec/long/")]
+    for meter, numbers in {"m0": range(296, 300), "m4": range(296, 300), "rare": range(2)}.items():
+        mine = [int(one.payload) for one in kept if one.key == f"gridsec/long/meter/{meter}/reading"]
+        assert mine == list(numbers)
+    assert len(kept) == 5 * NEWEST + 2
+    assert counts == {"long": 5 * (300 - NEWEST)}
+
+
+def test_keys_of_known_meters_are_declared_until_their_feeder_leaves() -> None:
+    sink = Sink()
+    with pair(sink, expects=lambda key: "/meter/m" in key) as (bus, meters, _):
+        bus.follow("f")
+        keys = {f"f/meter/{meter}/reading" for meter in ("m1", "m2", "junk")}
+        for _ in range(3):
+            for key in keys:
+                meters.put(key, b"{}")
+        until(lambda: len(sink.samples) == 9)
+        declared = bus._followed["f"].keys
+        until(lambda: all(key is not None for key in declared.values()))
+        assert {str(key) for key in declared.values()} == {
+            "gridsec/f/meter/m1/reading",
+            "gridsec/f/meter/m2/reading",
+        }
+        bus.unfollow("f")
+        bus.follow("f")
+        # The keys are received as before, and declared again.
+        for key in keys:
+            meters.put(key, b"again")
+        until(lambda: len(sink.samples) == 12)
+        until(lambda: len(bus._followed["f"].keys) == 2)
+
+
+@pytest.mark.parametrize("side", ["listen", "connect"])
+def test_small_socket_buffers_bound_the_data_under_way(side: str) -> None:
+    """A receiver that takes nothing stops the sender after the buffers: 64 KiB each, and those of zenoh."""
+    end = "tcp/127.0.0.1:7447"
+    built = zenoh_bus._config(BusConfig("client", **{side: (end,)}))  # type: ignore[arg-type]
+    ends = json.loads(built.get_json(f"{side}/endpoints"))
+    assert ends == [f"{end}#so_rcvbuf=65536;so_sndbuf=65536"]
+
+
 def test_a_look_at_many_full_queues_is_delivered_in_parts() -> None:
-    sink, feeders = Sink(), [f"f{k}" for k in range(5)]
-    with pair(sink) as (bus, meters, _):
+    sink, feeders, slow = Sink(), [f"f{k}" for k in range(5)], threading.Event()
+    with pair(sink, slow=slow) as (bus, meters, _):
         for feeder in feeders:
             bus.follow(feeder)
-        for k in range(2 * BATCH):
+        # The first look waits with a few of them.
+        for k in range(BATCH):
             for feeder in feeders:
                 meters.put(f"{feeder}/meter/a/reading", str(k).encode())
         meters.put("*/meter/a/reading", b"pattern")
-        until(lambda: len(sink.samples) > 10 * BATCH)
+        slow.set()
+        until(lambda: len(sink.samples) > 5 * BATCH)
         until(lambda: sink.samples[-1].payload == b"pattern")
     for feeder in feeders:
         own = [int(one.payload) for one in sink.samples if one.key.startswith(f"gridsec/{feeder}/")]
-        assert own == list(range(2 * BATCH))
+        assert own == list(range(BATCH))
     assert [one.key for one in sink.samples].count("gridsec/*/meter/a/reading") == 1
     assert max(map(len, sink.batches)) < 3 * BATCH
 
