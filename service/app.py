@@ -29,7 +29,7 @@ from service.engine.engine import RuntimeConfig
 from service.engine.runtime import Runtime
 from service.errors import prefixed
 from service.ingest.align import Clock
-from service.ingest.queues import BusConfig, Sample, StoredEvent
+from service.ingest.queues import BusConfig, StoredEvent
 from service.ingest.zenoh_bus import Bus
 from service.metrics import Metrics
 from service.notify.delivery import Notifier
@@ -91,15 +91,7 @@ async def serve(
         runtime = Runtime(
             config, store, sites.values(), given=given, unloaded=unloaded, wall=wall, settled=settled
         )
-        bus = bus_of(
-            settings,
-            shares,
-            runtime.deliver,
-            missed=partial(missed, store),
-            wall=wall,
-            count=runtime.count,
-            expects=runtime.expects,
-        )
+        bus = bus_of(settings, shares, runtime, missed=partial(missed, store), wall=wall)
         runtime.attach(stack.enter_context(bus))
         await http.serve(stack, runtime, tuple(sites), announce=announce, signals=signals, stopping=stopping)
 
@@ -122,15 +114,16 @@ def runtime_config(settings: Settings) -> RuntimeConfig:
 def bus_of(
     settings: Settings,
     shares: Shares,
-    deliver: Callable[[list[Sample]], object],
+    receiver: Runtime | None,
     *,
     missed: Callable[[str, int, int], Iterable[StoredEvent]] | None,
     wall: Callable[[], float],
     everything: bool = True,
-    count: Callable[[str, int], object] = lambda *_: None,
-    expects: Callable[[str], bool] = lambda _: False,
 ) -> Bus:
-    """Return the zenoh session of a process; the parameters are those of `Bus`."""
+    """Return the zenoh session of a process, without a receiver of readings for a front.
+
+    The other parameters are those of `Bus`.
+    """
     config = BusConfig(
         settings.zenoh_mode,
         settings.listen,
@@ -139,17 +132,19 @@ def bus_of(
         max_sessions=shares.sessions,
         accept_pending=shares.pending,
     )
+    receiving: dict[str, Any] = {}
+    if receiver is not None:
+        receiving = {"count": receiver.count, "expects": receiver.expects}
     return Bus(
         config,
         settings.prefix,
-        deliver,
+        receiver.deliver if receiver is not None else lambda _: None,
         max_payload=settings.max_payload,
         lossless=settings.clock is Clock.EVENTS,
         wall=wall,
         missed=missed,
         everything=everything,
-        count=count,
-        expects=expects,
+        **receiving,
     )
 
 

@@ -40,7 +40,7 @@ class Metrics:
         """Metrics of the input."""
         counter = partial(Counter, registry=registry)
         self.samples = counter("gridsec_samples", "Payloads received over zenoh.")
-        self.dropped = counter("gridsec_samples_dropped", "Payloads dropped because the queue was full.")
+        self.dropped = counter("gridsec_samples_dropped", "Payloads dropped from a full or long queue.")
         self.readings = counter(
             "gridsec_readings", "Well-formed readings, by outcome.", ["feeder", "outcome"]
         )
@@ -77,7 +77,7 @@ class Metrics:
             "gridsec_meters_learning_delayed", "Meters behind schedule, by reason.", ["feeder", "reason"]
         )
         self.alarms = gauge("gridsec_alarms_active", "Active alarms.", ["feeder"])
-        self.shed = gauge("gridsec_feeders_shed", "Feeders that are not monitored because of overload.")
+        self.shed = gauge("gridsec_feeders_shed", "Feeders displayed as not monitored because of overload.")
         self.cycle = Histogram(
             "gridsec_cycle_seconds",
             "One round of the runtime: decode, align, estimate, store.",

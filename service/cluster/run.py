@@ -218,9 +218,7 @@ async def serve_front(
             wall=wall,
         )
         workers.changed = front.heard
-        bus = bus_of(
-            settings, shares, lambda _: None, missed=partial(missed, store), wall=wall, everything=False
-        )
+        bus = bus_of(settings, shares, None, missed=partial(missed, store), wall=wall, everything=False)
         stack.enter_context(bus)
         caller = Caller(bus.ask, envelope)
         forwarder = Forwarder(

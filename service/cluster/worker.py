@@ -309,16 +309,7 @@ async def work(
             acts=member.acts,
         )
         runtime = Runtime(config, store, (), given=(), wall=wall, settled=settled)
-        bus = bus_of(
-            settings,
-            shares,
-            runtime.deliver,
-            missed=None,
-            wall=wall,
-            everything=False,
-            count=runtime.count,
-            expects=runtime.expects,
-        )
+        bus = bus_of(settings, shares, runtime, missed=None, wall=wall, everything=False)
         stack.enter_context(bus)
         runtime.attach(bus)
         loop = asyncio.get_running_loop()

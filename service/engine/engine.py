@@ -543,13 +543,9 @@ class Engine:
         self.load.count_round(lasted, spent, placed - begun, len(samples))
         return bool(results)
 
-    def control(self, inbox: Inbox, dropped: int) -> None:
-        """Under lasting overload, stop monitoring some feeders, and begin again as soon as the load fits.
-
-        `dropped` is the number of samples that the queue has dropped since the last call.
-        """
-        self.load.count_dropped(dropped)
-        if self.load.update(inbox.offered):
+    def control(self, inbox: Inbox) -> None:
+        """Under lasting overload, stop monitoring some feeders, and begin again as soon as the load fits."""
+        if self.load.update(inbox.counts):
             self.follow_load(inbox)
 
     def follow_load(self, inbox: Inbox) -> None:

@@ -103,7 +103,7 @@ class Network(Publisher, Protocol):
         """End the effect of `follow`; idempotent."""
 
     def discard(self, feeders: Collection[str]) -> None:
-        """Count the readings of exactly these followed feeders, instead of delivering them."""
+        """Count the readings of exactly these followed feeders, and deliver none, from the next look on."""
 
 
 class Runtime:
@@ -153,7 +153,6 @@ class Runtime:
         self._prefix = f"{config.prefix}/"
         self._bus: Network | None = None
         self._followed: Mapping[str, FeederMonitor] = {}
-        self._dropped = 0
         self._commands: deque[tuple[Callable[[], Future[Any]], asyncio.Future[Any]]] = deque()
         self._prepared: set[asyncio.Future[tuple[Site, DesignedEstimator]]] = set()
         self._streams = WakeUps()
@@ -185,19 +184,13 @@ class Runtime:
         dropped = self._inbox.put(batch)
         self._engine.metrics.samples.inc(len(batch))
         self._engine.metrics.dropped.inc(dropped + self._inbox.surplus - before)
-        self._dropped += dropped
         return dropped
 
-    def count(self, feeder: str, number: int) -> None:
-        """Count samples of a feeder that the receiving thread does not deliver.
-
-        They are discarded if the feeder is shed, and dropped otherwise.
-        """
-        self._inbox.count(feeder, number)
-        self._engine.metrics.samples.inc(number)
-        if feeder not in self._inbox.shed:
-            self._engine.metrics.dropped.inc(number)
-            self._dropped += number
+    def count(self, feeder: str, offered: int, dropped: int) -> None:
+        """Count samples of a feeder that the receiving thread does not deliver; some of them are dropped."""
+        self._inbox.count(feeder, offered, dropped)
+        self._engine.metrics.samples.inc(offered)
+        self._engine.metrics.dropped.inc(dropped)
 
     def expects(self, key: str) -> bool:
         """True for a zenoh key of single readings of a monitored meter."""
@@ -240,12 +233,9 @@ class Runtime:
             self._writer.shutdown(wait=False)
 
     def _follow(self) -> None:
-        """Subscribe to the readings of exactly the monitored feeders; those of shed ones are counted only."""
+        """Subscribe to the readings of exactly the monitored feeders."""
         monitored = self._engine.monitors
-        if self._bus is None:
-            return
-        self._bus.discard(self._inbox.shed)
-        if monitored is self._followed:
+        if self._bus is None or monitored is self._followed:
             return
         for name in self._followed.keys() - monitored.keys():
             self._bus.unfollow(name)
@@ -259,8 +249,9 @@ class Runtime:
     def _round(self) -> bool:
         news = self._engine.cycle(self._samples(), self._inbox.oldest)
         if not self._waits:
-            dropped, self._dropped = self._dropped, 0
-            self._engine.control(self._inbox, dropped)
+            self._engine.control(self._inbox)
+            if self._bus is not None:
+                self._bus.discard(self._inbox.shed)
         self._settle()
         return news
 
@@ -537,7 +528,8 @@ class Runtime:
             told, waits = monitor.latest, engine.config.clock is Clock.WALL
             if waits and told is not None and monitor.stale(age := self.age(told)):
                 problems.append(f"feeder {monitor.name}: the latest report is {age:.0f} s old")
-        if shed := engine.shed_displayed():
+        # The list follows the decision with a tick, and stays after the return until a verdict is sure.
+        if shed := max(len(self._inbox.shed), engine.shed_displayed()):
             problems.append(f"overload: {shed} of {len(engine.monitors)} feeders are not monitored")
         for name, problem in engine.unloaded.copy().items():
             problems.append(f"feeder {name}: {problem}")

@@ -78,6 +78,13 @@ THINNED = 8
 """Divisor of the length of such a queue: this part is dropped at once. A drop reads the whole queue."""
 
 
+class Counts(NamedTuple):
+    """Numbers of samples of a feeder so far."""
+
+    offered: int  # all of them, discarded and dropped ones included
+    dropped: int  # those that a full queue has dropped
+
+
 @dataclass(slots=True)
 class _Lane:
     """Queue of one feeder."""
@@ -85,6 +92,7 @@ class _Lane:
     waiting: deque[Sample] = field(default_factory=deque)
     bytes: int = 0  # memory of the waiting samples
     offered: int = 0  # number of all samples so far
+    dropped: int = 0  # those of them that a full queue has dropped
 
     def drop(self) -> int:
         """Drop the oldest sample; of a long queue a part, of the keys with the most. Return the number."""
@@ -168,15 +176,18 @@ class Inbox:
             each = self._lanes.items()
             return {name: lane.waiting[0].arrival for name, lane in each if name is not None and lane.waiting}
 
-    def offered(self) -> dict[str, int]:
-        """Return the number of samples of each feeder so far, discarded ones included."""
+    def counts(self) -> dict[str, Counts]:
+        """Return the numbers of samples of each feeder so far."""
         with self._room:
-            return {name: lane.offered for name, lane in self._lanes.items() if name is not None}
+            each = self._lanes.items()
+            return {name: Counts(lane.offered, lane.dropped) for name, lane in each if name is not None}
 
-    def count(self, feeder: str, number: int) -> None:
-        """Count samples of a feeder that are discarded before the queue."""
+    def count(self, feeder: str, offered: int, dropped: int) -> None:
+        """Count samples of a feeder that do not reach the queue."""
         with self._room:
-            self._lanes.setdefault(feeder, _Lane()).offered += number
+            lane = self._lanes.setdefault(feeder, _Lane())
+            lane.offered += offered
+            lane.dropped += dropped
 
     def put(self, batch: list[Sample]) -> int:
         """Add samples; called from any thread. Returns the number of dropped ones beside the surplus."""
@@ -210,6 +221,7 @@ class Inbox:
     def _drop(self, lane: _Lane) -> int:
         before = lane.bytes
         dropped = lane.drop()
+        lane.dropped += dropped
         self._bytes -= before - lane.bytes
         self._length -= dropped
         return dropped
@@ -236,7 +248,7 @@ class Inbox:
             if lane is not None:
                 self._length -= len(lane.waiting)
                 self._bytes -= lane.bytes
-                self._lanes[feeder] = _Lane(offered=lane.offered)
+                self._lanes[feeder] = _Lane(offered=lane.offered, dropped=lane.dropped)
 
     def close(self) -> None:
         """Release blocked senders; later samples are discarded."""

@@ -53,7 +53,9 @@ BATCH = 1024
 NEWEST = 4
 """Number of the newest samples of a key that are taken from a queue with more than `BATCH`."""
 DECLARING_S = 0.005
-"""Time for declarations of keys after a look at the queues, s; one takes 0.05 to 0.5 ms."""
+"""Time for declarations of keys after a look at the queues, s."""
+KEYS_DECLARED = 20_000
+"""Largest number of declared keys: one takes 0.2 ms then, in proportion to their number."""
 _HEAD = 1024
 QUERIES_WAITING = 256
 _ESTIMATES = 1024
@@ -214,9 +216,8 @@ class Bus:
     missed: called with `alarm` or `incident`, a number and a limit; returns the stored events after the
         number, oldest first. A GridsecError that it raises is the reply. None: such queries get no reply.
     everything: receive the keys of all other feeders as well, to report them as bad readings.
-    count: called from the receiving threads with a feeder and the number of its samples that are not
-        delivered: all of a feeder of `discard`, and the older ones of a long queue.
-
+    count: called from the receiving threads with a feeder, the number of its samples that are not delivered,
+        and the number of those of them that are dropped: 0 for a feeder of `discard`, all of a long queue.
     expects: True for a key of single readings of a meter that is known; it is declared when it arrives.
         zenoh compares other keys with the subscriptions of all feeders at each put.
 
@@ -235,7 +236,7 @@ class Bus:
         wall: Callable[[], float] = time.time,
         missed: Callable[[str, int, int], Iterable[StoredEvent]] | None = lambda *_: (),
         everything: bool = True,
-        count: Callable[[str, int], object] = lambda *_: None,
+        count: Callable[[str, int, int], object] = lambda *_: None,
         expects: Callable[[str], bool] = lambda _: False,
     ) -> None:
         self._wall, self._missed, self._everything = wall, missed, everything
@@ -243,6 +244,7 @@ class Bus:
         self._followed: dict[str, _Followed] = {}
         self._discarded: Collection[str] = frozenset()
         self._arrived: deque[tuple[str, _Followed, str]] = deque()  # keys to be declared
+        self._declared = 0  # number of declared keys
         self._count, self._expects = count, expects
         self._others: _Subscription | None = None
         self._closing = threading.Event()
@@ -324,12 +326,11 @@ class Bus:
         """End the effect of `follow`; idempotent."""
         if (made := self._followed.pop(feeder, None)) is not None:
             made.subscriber.undeclare()  # type: ignore[no-untyped-call]
-            for key in made.keys.values():
-                if key is not None:
-                    self._session().undeclare(key)
+            for key in [one for one in list(made.keys.values()) if one is not None]:
+                self._undeclare(key)
 
     def discard(self, feeders: Collection[str]) -> None:
-        """Count the samples of exactly these followed feeders from now on, instead of delivering them."""
+        """Count the samples of exactly these followed feeders, and deliver none, from the next look on."""
         self._discarded = feeders
 
     def _receive(self, handler: _Handler) -> None:
@@ -363,31 +364,43 @@ class Bus:
                 batch += self._copies(self._readings(_waiting(self._others[1], BATCH)))
             if batch:
                 self._deliver(batch)
-            self._declare(self._session())
+            self._declare(closing)
 
     def _take(self, feeder: str, followed: _Followed, waiting: Iterable[zenoh.Sample]) -> list[Sample]:
         """Copies of a feeder's waiting samples; the others are counted."""
+        found = self._readings(waiting, feeder)
         if feeder in self._discarded:
-            self._count(feeder, sum(1 for _ in waiting))
+            self._count(feeder, sum(1 for _ in found), 0)
             return []
-        found = list(self._readings(waiting, feeder))
-        if len(found) > BATCH:
-            newest = _newest(found)
-            self._count(feeder, len(found) - len(newest))
-            found = newest
-        for key, _ in found:
+        readings = list(found)
+        if len(readings) > BATCH:
+            newest = _newest(readings)
+            older = len(readings) - len(newest)
+            self._count(feeder, older, older)
+            readings = newest
+        for key, _ in readings:
             if key not in followed.keys and self._expects(key):
                 followed.keys[key] = None
                 self._arrived.append((feeder, followed, key))
-        return self._copies(found)
+        return self._copies(readings)
 
-    def _declare(self, live: zenoh.Session) -> None:
+    def _declare(self, closing: threading.Event) -> None:
         """Declare keys that have arrived, within a time limit."""
-        end = time.monotonic() + DECLARING_S
-        while self._arrived and time.monotonic() < end:
+        live, end = self._session(), time.monotonic() + DECLARING_S
+        while self._arrived and time.monotonic() < end and not closing.is_set():
             feeder, followed, key = self._arrived.popleft()
-            if self._followed.get(feeder) is followed:
-                followed.keys[key] = live.declare_keyexpr(key)
+            if self._followed.get(feeder) is not followed or self._declared >= KEYS_DECLARED:
+                continue
+            with suppress(zenoh.ZError):  # the session is closed: reception ends by itself
+                followed.keys[key] = made = live.declare_keyexpr(key)
+                self._declared += 1
+                if self._followed.get(feeder) is not followed:  # meanwhile
+                    self._undeclare(made)
+
+    def _undeclare(self, key: zenoh.KeyExpr) -> None:
+        self._declared -= 1
+        with suppress(zenoh.ZError):  # the session is closed
+            self._session().undeclare(key)
 
     def _readings(self, samples: Iterable[zenoh.Sample], feeder: str | None = None) -> Iterator[_Keyed]:
         """Readings among some samples, with keys of one feeder, or None: of no followed one.
@@ -672,15 +685,13 @@ def _waiting(handler: _Handler, most: int, *first: zenoh.Sample) -> Iterator[zen
 
 
 def _newest(found: Sequence[_Keyed]) -> list[_Keyed]:
-    """The newest samples, `NEWEST` of each key and `BATCH` together, oldest first."""
+    """The `NEWEST` samples of each key, oldest first."""
     counts: Counter[str] = Counter()
     newest: list[_Keyed] = []
     for one in reversed(found):
         counts[one[0]] += 1
         if counts[one[0]] <= NEWEST:
             newest.append(one)
-        if len(newest) == BATCH:
-            break
     return newest[::-1]
 
 

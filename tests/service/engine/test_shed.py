@@ -221,7 +221,7 @@ def test_a_shed_feeder_that_is_put_again_stays_shed(pair: Pair) -> None:
     pair.run(3)
     pair.shed(OTHER)
     pair.run(2)
-    offered = pair.live.load.feeders[OTHER].offered = pair.box.offered()[OTHER]
+    offered = pair.live.load.feeders[OTHER].offered = pair.box.counts()[OTHER].offered
     pair.live.add(pair.other).install(design(pair.other))
     # The count of its samples goes on: the next window sees no flood.
     assert pair.live.load.feeders[OTHER].offered == offered > 0

@@ -50,7 +50,7 @@ def not_evaluated(village: Any) -> Any:
     return replace(blind, meters=meters, model_only=True)
 
 
-@pytest.mark.parametrize(("later_s", "words"), [(-2.0, "not evaluated"), (1.0, "data stale")])
+@pytest.mark.parametrize(("later_s", "words"), [(-10.0, "not evaluated"), (1.0, "data stale")])
 def test_rare_states_of_a_shed_feeder_are_stale_later(
     site_of: Callable[..., Site], village: Callable[..., Any], later_s: float, words: str
 ) -> None:
