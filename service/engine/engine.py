@@ -296,9 +296,9 @@ class Engine:
         self._wakes[name] = -math.inf
         settings = site.tables.meta.monitor
         old = self.load.feeders.get(name)
-        self.load.feeders[name] = FeederLoad(
-            settings.tick_s, len(site.meter_ids) + 1, offered=old.offered if old else 0
-        )
+        load = self.load.feeders[name] = FeederLoad(settings.tick_s, len(site.meter_ids) + 1)
+        if old is not None:
+            load.offered, load.dropped = old.offered, old.dropped
         if name in self.load.shed:
             monitor.set_shed(True, self._wall())
         self.unloaded.pop(name, None)
