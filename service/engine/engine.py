@@ -27,7 +27,6 @@ import structlog
 
 from feeders.model.site import Site
 from gridsec.errors import GridsecError
-from gridsec.interface import Cause
 from service.access.signing import MeterKeys
 from service.alarms.incidents import IncidentEvent, event_json
 from service.alarms.state_machine import (
@@ -565,8 +564,7 @@ class Engine:
 
     def shed_displayed(self) -> int:
         """Number of feeders that are displayed as not monitored because of overload, as in their list."""
-        latest = (monitor.latest for monitor in self.monitors.values())
-        return sum(one is not None and one.summary["cause"] is Cause.OVERLOAD for one in latest)
+        return sum(monitor.shows_overload for monitor in self.monitors.values())
 
     def _reach(self, now: float, waiting: Mapping[str, float]) -> None:
         """Add the ticks that are due at the wall time `now`, Unix s, to the pending ones.

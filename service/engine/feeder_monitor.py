@@ -338,10 +338,15 @@ class FeederMonitor:
         rules = self.aligner.rules
         return max(PATIENCE_MIN_S, 3.0 * rules.tick_s + rules.grace_s)
 
+    @property
+    def shows_overload(self) -> bool:
+        """True while the list of feeders states `overload` as its cause."""
+        return self.latest is not None and self.latest.summary["cause"] is Cause.OVERLOAD
+
     def stale(self, age_s: float) -> bool:
         """True if the latest tick, of this age, s, is late; those that display the overload are rare."""
-        told, patience_s = self.latest, self.patience_s
-        if told is not None and told.summary["cause"] is Cause.OVERLOAD:
+        patience_s = self.patience_s
+        if self.shows_overload:
             patience_s = feeder_info.patience_shed_s(patience_s, self.aligner.rules.tick_s)
         return age_s > patience_s
 
@@ -404,8 +409,7 @@ class FeederMonitor:
     @property
     def _rests(self) -> bool:
         """True while it is shed, the display states it, and no alarm waits for its delay."""
-        shown = None if self.latest is None else self.latest.displayed
-        if not self.shed or shown is None or shown[0].cause is not Cause.OVERLOAD:
+        if not self.shed or not self.shows_overload:
             return False
         return any(alarm.kind is AlarmKind.UNDECIDED for alarm in self.book.active)
 

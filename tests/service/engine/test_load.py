@@ -39,6 +39,15 @@ class Machine:
     def shed(self) -> set[str]:
         return set(self.control.shed)
 
+    def window(
+        self, lasted_s: float, rounds_s: float, placed_s: float, samples: int, of_s: float = 1.0
+    ) -> None:
+        """One round of these times and samples in a window of `of_s`."""
+        self.control.count_round(0.0, 0.0, 0.0, 0)
+        self.t += of_s
+        self.control.count_round(lasted_s, rounds_s, placed_s, samples)
+        self.control.update(self.counts)
+
     def second(
         self,
         rate: float,
@@ -226,14 +235,11 @@ def test_time_that_the_model_does_not_explain_counts() -> None:
     def second(dropped: int) -> None:
         for name in machine.offered:
             machine.offered[name] += 15
-        control.count_round(0.0, 0.0, 0.0, 0)
-        machine.t += 1.0
-        kept = 20 - len(machine.shed)
-        lasted = min(1.0, kept / 10)  # ten feeders take all the time
-        control.count_round(lasted, 0.005 * kept, 0.005 * kept, 15 * (kept - dropped))
         for name in list(machine.offered)[:dropped]:
             machine.dropped[name] += 15
-        control.update(machine.counts)
+        kept = 20 - len(machine.shed)
+        lasted = min(1.0, kept / 10)  # ten feeders take all the time
+        machine.window(lasted, 0.005 * kept, 0.005 * kept, 15 * (kept - dropped))
 
     for _ in range(3):
         second(10)
@@ -249,16 +255,12 @@ def test_time_that_the_model_does_not_explain_counts() -> None:
 def test_one_window_with_few_samples_sheds_no_more_feeders() -> None:
     """The ratio of needed to processed samples is bounded, though all samples of a window are dropped."""
     machine = Machine(100)
-    control = machine.control
 
     def second(samples: int) -> None:
         for name in machine.offered:
             machine.offered[name] += 10
             machine.dropped[name] += 10 - samples // 100
-        control.count_round(0.0, 0.0, 0.0, 0)
-        machine.t += 2.0
-        control.count_round(2.0, 0.8e-3 * samples, 0.4e-3 * samples, samples)
-        control.update(machine.counts)
+        machine.window(2.0, 0.8e-3 * samples, 0.4e-3 * samples, samples, of_s=2.0)
 
     second(1000)
     second(10)
@@ -268,15 +270,11 @@ def test_one_window_with_few_samples_sheds_no_more_feeders() -> None:
 
 def test_a_flood_that_drops_its_own_samples_sheds_no_neighbour() -> None:
     machine = Machine(100)
-    control = machine.control
     for _ in range(10):
         for name in machine.offered:
             machine.offered[name] += 16_000 if name == "f7" else 10
         machine.dropped["f7"] += 15_000
-        control.count_round(0.0, 0.0, 0.0, 0)
-        machine.t += 1.0
-        control.count_round(0.6, 0.6, 0.3, 2_000)
-        control.update(machine.counts)
+        machine.window(0.6, 0.6, 0.3, 2_000)
         assert machine.shed <= {"f7"}
 
 
@@ -291,9 +289,7 @@ def test_many_short_rounds_keep_no_feeder_out() -> None:
             machine.offered[name] += 10
         for _ in range(70):
             machine.control.count_round(0.0102, 0.0012, 0.001, 1)
-        machine.t += 1.0
-        machine.control.count_round(0.0, 0.0, 0.0, 0)
-        machine.control.update(machine.counts)
+        machine.window(0.0, 0.0, 0.0, 0)
     assert not machine.shed
 
 
