@@ -6,8 +6,8 @@ the statistical core for a step of age n is, with the exact information I of all
     members:  |(U I U' a)_j| <= y_j,  y_j: log Lambda(y_j, F_jj) = log gamma - log(weight capital / p)
     omnibus:  a' U I M I U' a <= 2 (log gamma - log(weight capital)) + log det,
 
-M being the quadratic form of `gridsec.estimators.modal.detector.omnibus`. Other estimators of the registry
-are played with the attacks made for the default monitor.
+M being the quadratic form of `gridsec.estimators.modal.detector.omnibus`. The powers' part of the test is
+left out. Other estimators of the registry are played with the attacks made for the default monitor.
 """
 
 from __future__ import annotations
@@ -25,18 +25,14 @@ from feeders.model.site import Site, Snapshot, from_tables, late
 from feeders.registry import SEQUENTIAL, DesignedEstimator, design
 from feeders.simulation.scenario import START
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.estimators import sequential
-from gridsec.estimators.modal import core, detector, estimate, signatures
-from gridsec.estimators.modal.core import Core, CoreState, Suspicion
+from gridsec.estimators.modal import detector, estimate, signatures
+from gridsec.estimators.modal.core import Core, CoreState
 from gridsec.estimators.sequential import SequentialDesign, SequentialState
-from gridsec.estimators.sequential.meter_bias import Learned, class_only
 from gridsec.estimators.sequential.time_scales import Scales
 from gridsec.grid.network import Power
 from gridsec.interface import Decision, Frame
 from gridsec.planning.unavoidable import AcceptanceRegion, Faults
 
-SHADOW = "modal-shadow"
-"""The statistical core behind the default monitor's front end, not an estimator of the registry."""
 LATE_S = 60.0
 """Age of late powers, s."""
 LARGEST = 0.2
@@ -128,20 +124,27 @@ class Registered:
     Parameters
     ----------
     name
-        Its name; the default monitor starts with the learned errors, others learn by themselves.
+        Its name.
     world
         The world.
     """
 
     def __init__(self, name: str, world: World) -> None:
+        self.name, self.feeder = name, world.setting.feeder
         self.design = world.monitor if name == SEQUENTIAL else _other(name, world)
-        self.default = name == SEQUENTIAL
 
-    def start(self, known: Learned | None, learning: Iterable[Frame]) -> Any:  # noqa: ARG002  # as `Shadow`
-        """State before the first frame, with what the default monitor learned."""
-        if self.default:
-            return sequential.init(self.design.design, START, known)
-        return self.design.init(START)
+    def start(self, learning: Iterable[Frame]) -> Any:
+        """State before the first frame, with the errors learned by the frames of the learning run, if any."""
+        frames, by = list(learning), self.design.family.bias_learning
+        if not frames or by is None:
+            return self.design.init(START)
+        made = watcher(
+            self.feeder, Model.MATCHED, step_s=LEARN_STEP_S, commission_s=LEARN_S, estimator=self.name
+        )
+        state = made.init(START - LEARN_S - 2.0 * LEARN_STEP_S)
+        for frame in frames:
+            state, _, _ = made.step(state, frame)
+        return by.init(self.design.design, START, replace(by.commission(state), learning=None))
 
     def step(self, state: Any, frame: Frame) -> tuple[Any, Answer]:
         """Process one frame."""
@@ -151,75 +154,8 @@ class Registered:
 
 def _other(name: str, world: World) -> DesignedEstimator:
     tables = world.site.tables
-    settings = replace(tables.meta.monitor, estimator=name, commission_s=0.0)
+    settings = replace(tables.meta.monitor, estimator=name, commission_s=0.0, tick_s=1.0)
     return design(from_tables(replace(tables, meta=replace(tables.meta, monitor=settings))))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Both:
-    """Front end and core."""
-
-    front: SequentialState
-    core: CoreState
-    suspicion: Suspicion | None = None
-
-
-class Shadow:
-    """The core behind the default monitor's front end; every customer has a meter.
-
-    ATTACKED: a meter is masked. UNDECIDED: log M is beyond its limit. Else CLEAN.
-
-    Parameters
-    ----------
-    world
-        The world.
-    """
-
-    LOOK = 4
-    """Ticks from one search to the next while log M is beyond its limit: a search takes long."""
-
-    def __init__(self, world: World) -> None:
-        self.front: SequentialDesign = world.monitor.design
-        tables = world.site.tables
-        kw = np.array([max(row.load_kw, row.pv_kw) for row in tables.customers])
-        self.core: Core = core.design(self.front, kw / world.site.feeder.base_kva)
-        self.world = world
-
-    def start(self, known: Learned | None, learning: Iterable[Frame]) -> Both:
-        """State before the first frame; the core has followed the frames of the learning run."""
-        made, begin = learner(self.world.setting.feeder), START - LEARN_S - 2.0 * LEARN_STEP_S
-        # A front end that learns nothing: fixed errors stay in its residuals.
-        front, state = sequential.init(made, begin, class_only(made)), core.init(self.core, begin)
-        for frame in learning:
-            front, _, _ = sequential.step(made, front, frame)
-            m, seen = core.residuals(front)
-            state, _ = core.step(self.core, state, frame.t, m, seen)
-        return Both(sequential.init(self.front, START, known), state)
-
-    def step(self, state: Both, frame: Frame) -> tuple[Both, Answer]:
-        """Process one frame."""
-        front, _, _ = sequential.step(self.front, state.front, frame)
-        m, seen = core.residuals(front)
-        now, evidence = core.step(self.core, state.core, frame.t, m, seen)
-        alarm, suspicion = core.alarmed(self.core, evidence), None
-        if alarm and front.ticks % self.LOOK == 0:
-            suspicion = core.identify(self.core, now, evidence)
-            if suspicion.found.named.any():
-                now, evidence = core.mask(self.core, now, suspicion)
-                alarm, suspicion = core.alarmed(self.core, evidence), None
-        shift = core.estimate(self.core, now, suspicion).mean[self.front.prior.meters]
-        named = now.masked.meters
-        decision = Decision.ATTACKED if named.any() else Decision.UNDECIDED if alarm else Decision.CLEAN
-        v2 = np.empty(m.size)
-        v2[self.front.plant.meters] = frame.y - m + shift
-        return Both(front, now, suspicion), Answer(v2, decision, named)
-
-
-def learner(feeder: str) -> SequentialDesign:
-    """The default monitor with the tick of the learning run."""
-    made = watcher(feeder, Model.MATCHED, step_s=LEARN_STEP_S, commission_s=LEARN_S).design
-    assert isinstance(made, SequentialDesign)
-    return made
 
 
 def learning(setting: Setting) -> Iterator[Frame]:

@@ -6,8 +6,8 @@ The truth is AC power flow with the droop inverters in closed loop; meters have 
 files, and fixed errors are learned over six hours unless stated otherwise. A coalition chooses false voltages
 (and powers, and the busbar's reading) that maximise the error of one reconstructed voltage within a share of
 every limit of the estimator: a second-order cone program (`gridsec.planning.unavoidable`) against the tests
-of `sequential`, or of the statistical core (`--estimator modal-shadow`). Other estimators of the registry are
-attacked with the programs made for `sequential`.
+of `sequential`, or of `modal`. Other estimators of the registry are attacked with the programs made for
+`sequential`.
 
 Attacks, of a contiguous third of the meters unless stated otherwise:
 
@@ -48,22 +48,17 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks._adversary import (
-    SHADOW,
     Answer,
     Registered,
-    Shadow,
     World,
     core_region,
     falsified,
     faults,
-    learner,
     learning,
     scales,
 )
 from benchmarks._arguments import count
 from benchmarks._scenes import (
-    LEARN_S,
-    LEARN_STEP_S,
     Model,
     Setting,
     beyond,
@@ -76,6 +71,7 @@ from feeders.registry import SEQUENTIAL
 from feeders.simulation.scenario import START
 from gridsec.arrays import Floats, Ints
 from gridsec.estimators import sequential
+from gridsec.estimators.modal.monitor import ModalDesign
 from gridsec.estimators.sequential import SequentialState
 from gridsec.interface import Decision, Frame
 from gridsec.planning.detectability import acceptance_region, honest_covariance
@@ -235,17 +231,17 @@ class Scene:
     feeder, seed
         Where, and what is random.
     estimator
-        A name of the registry, or `SHADOW`.
+        A name of the registry.
     """
 
     def __init__(self, kind: Kind, feeder: str, seed: int, estimator: str) -> None:
         self.kind = kind
         self.world = World(Setting(feeder, Model.MATCHED, learned=True, seed=seed), kind.aged)
         self.site, self.made = self.world.site, self.world.monitor.design
-        self.monitor = Shadow(self.world) if estimator == SHADOW else Registered(estimator, self.world)
+        self.monitor = Registered(estimator, self.world)
         known = learned(self.world.setting) if kind.learned else None
         front = sequential.init(self.made, START, known)
-        self.before = self.monitor.start(known, learning(self.world.setting) if kind.learned else ())
+        self.before = self.monitor.start(learning(self.world.setting) if kind.learned else ())
         first = int(np.argmax(self.made.prior.variance[self.made.prior.meters]))
         self.meters = kind.place(self.site, first, seed)
         self.frames = [
@@ -290,11 +286,11 @@ class Scene:
 
     def region(self, pattern: Pattern) -> AcceptanceRegion:
         """Accepted displacements of a pattern: by the estimator's own tests where they are known."""
-        if isinstance(self.monitor, Shadow):
+        if isinstance(self.monitor.design.design, ModalDesign):
             state = self.before
             for frame, _ in self.frames[self.kind.calm :]:
                 state, _ = self.monitor.step(state, frame)
-            return core_region(self.monitor.core, state.core, min(self.kind.ticks, TICKS))
+            return core_region(self.monitor.design.design.core, state.core, min(self.kind.ticks, TICKS))
         level = np.array([pattern(age) for age in range(self.kind.ticks)])
         sums = np.concatenate([[0.0], np.cumsum(level)])
         ends = [np.abs(sums[n:] - sums[:-n]).max() / n for n in self.made.lengths]
@@ -363,13 +359,10 @@ class Scene:
 
     def _learned(self, amounts: Callable[[int], Floats] | None) -> object:
         """State of the monitor after six hours of learning under the attack."""
-        setting = self.world.setting
-        frames = [frame if amounts is None else self._false(frame, amounts(0)) for frame in learning(setting)]
-        made = learner(setting.feeder)
-        state = sequential.init(made, START - LEARN_S - 2.0 * LEARN_STEP_S)
-        for frame in frames:
-            state, _, _ = sequential.step(made, state, frame)
-        return self.monitor.start(state.learned, frames)
+        frames = learning(self.world.setting)
+        return self.monitor.start(
+            frame if amounts is None else self._false(frame, amounts(0)) for frame in frames
+        )
 
 
 def _root(v2: Floats) -> Floats:
@@ -390,18 +383,20 @@ def rows(name: str, feeder: str, seeds: int, estimator: str) -> Iterator[tuple[s
         yield variant, f"{scenes[0].meters.size} of {scenes[0].site.meters.size}", plays
 
 
-def line(head: tuple[str, ...], plays: list[Played]) -> str:
+def line(row: tuple[str, ...], plays: list[Played]) -> str:
     """One line of the table."""
     worst = max(plays, key=lambda one: (one.ratio, one.clean))
-    cells = [*head, f"{worst.share:g}", f"{worst.lie:.2f}", f"{worst.error:.2f}", f"{worst.clean:.0f}"]
+    cells = [*row, f"{worst.share:g}", f"{worst.lie:.2f}", f"{worst.error:.2f}", f"{worst.clean:.0f}"]
     cells += [f"{worst.minimum:.2f}", f"{worst.blind:.2f}", f"{worst.ratio:.2f}"]
     cells += [f"{worst.error / worst.blind:.2f}", f"{sum(one.named > 0 for one in plays)} of {len(plays)}"]
     cells += [f"{max(one.honest for one in plays)}"]
     return f"| {' | '.join(cells)} |"
 
 
-HEAD = ("feeder", "attack", "pattern", "meters", "share", "false V", "error V", "CLEAN %", "minimum V")
-HEAD += ("direction unknown V", "ratio", "ratio", "plays with names", "honest named")
+HEAD = (
+    *("feeder", "attack", "pattern", "meters", "share", "false V", "error V", "CLEAN %", "minimum V"),
+    *("direction unknown V", "ratio", "ratio", "plays with names", "honest named"),
+)
 
 
 def main(asked: argparse.Namespace) -> int:
@@ -423,7 +418,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("seeds", nargs="?", type=count, default=1)
     parser.add_argument("attacks", nargs="*", metavar="attack")
     parser.add_argument("--feeder", action="append", help="a feeder of the project; may be repeated")
-    parser.add_argument("--estimator", default=SEQUENTIAL, help=f"of the registry, or {SHADOW}")
+    parser.add_argument("--estimator", default=SEQUENTIAL, help="of the registry")
     return parser
 
 

@@ -11,8 +11,11 @@ than
 
 Steps and ramps describe a drift of unknown onset and shape to a share of its evidence only, `MISFIT`. The
 promise limits g: (J - C) + g and the masked meters are at most M or a third, whichever is larger. An
-explanation of more meters names none. Meters of one sign are on trial together: one that nothing replaces
-protects the others.
+explanation of more meters names none.
+
+**Decoys.** A meter of C that no g replaces must not protect the others. Where no g replaces C, the lateral
+with the most of C, but not all, splits it. Both parts are checked by themselves, and split again up to
+`SPLITS` times: honest meters that seem off together are neighbours.
 
 **Search of g.** Given the amounts of the rest J - C, g has the information F and the scores y. One amount x
 has the relaxation
@@ -20,8 +23,9 @@ has the relaxation
     minimise  x^2 g' F g / 2 - x y' g,      0 <= g <= 1,      g = 0 on C
 
 which is convex [1]_. Its solution orders the meters. The best beginning of this order is improved by single
-meters. x is first the mean amount of C, then that of the set found. g is also looked for in place of the
-rest's meters of its own sign, since colluding meters may share one amount.
+meters and by exchanges. x is first the mean amount of C, then that of the set found. Where that gains nothing
+and the solution has more meters than the promise, x is larger. g is also looked for in place of the rest's
+meters of its own sign, since colluding meters may share one amount.
 
 References
 ----------
@@ -34,6 +38,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import inf, log
+from typing import Self
 
 import numpy as np
 from scipy.optimize import minimize
@@ -49,19 +54,24 @@ from gridsec.estimators.modal.costs import (
     penalties,
 )
 from gridsec.estimators.modal.laterals import GAIN, OneAmount
+from gridsec.estimators.modal.mirrors import Neighbourhoods
 from gridsec.estimators.modal.search import ALIKE, DOUBT, Identification, costs_of, identified
 
 MISFIT = 0.1
 """Share of an explanation's evidence that steps and ramps leave open, 1."""
+SPLITS = 2
+"""Largest number of times that accused meters of one sign are split, 1: at most seven checks."""
 ROUNDS, WORTH = 4, 1.0
 """Largest number of amounts for which the relaxation is solved, and least gain of the cost by one more, 1."""
+LARGER = 1.5
+"""Next amount over the largest one tried where the relaxation has more meters than are promised, 1."""
 ITERATIONS = 300
 """Largest number of iterations of the relaxation; most take below 100."""
 HALF = 0.5
 """Share from which on a meter is in the set of the relaxation, and at its start, 1."""
 
 
-def weighed(found: Identification, masked: Bools, most: int) -> Identification:
+def weighed(found: Identification, masked: Bools, near: Neighbourhoods) -> Identification:
     """Explanations with sets of other meters that may replace accused ones.
 
     Parameters
@@ -70,14 +80,14 @@ def weighed(found: Identification, masked: Bools, most: int) -> Identification:
         The explanations.
     masked : (p,)
         Masked meters: they count in the promised number.
-    most
-        Largest number of manipulated meters that is promised.
+    near
+        Laterals, and the largest number of manipulated meters that is promised.
     """
     p, J = found.named.size, found.chosen[0]
     named = found.named & ~masked
     if not any_of(named) or (np.count_nonzero(J) == 1 and not any_of(masked)):
         return found
-    most = max(most, p // 3)
+    most = max(near.most, p // 3)
     if np.count_nonzero(J[:p] | masked) > most:
         return replace(found, named=found.named & masked)
     model = int(found.model[0])
@@ -85,9 +95,10 @@ def weighed(found: Identification, masked: Bools, most: int) -> Identification:
     amount[J] = mean_amounts(problem, J)
     by_model, least = costs_of(found), -2.0 * log(DOUBT)
     contested = np.zeros(p, dtype=np.bool_)
-    for sign in (1.0, -1.0):
-        # The onset may be older than that of a masked meter, which J then has, too.
-        accused = J[:p] & ~masked & (sign * amount[:p] > 0.0)
+    # The onset may be older than that of a masked meter, which J then has, too.
+    parts = [(sign, J[:p] & ~masked & (sign * amount[:p] > 0.0), SPLITS) for sign in (1.0, -1.0)]
+    while parts:
+        sign, accused, splits = parts.pop()
         if not any_of(accused & named):
             continue
         own, without = _own(problem, J, accused, sign)
@@ -99,6 +110,8 @@ def weighed(found: Identification, masked: Bools, most: int) -> Identification:
             # No more than J: few meters are likelier than many.
             cost = by_model[model][J.tobytes()] + max(more, GAIN)
             by_model[model][key] = min(cost, by_model[model].get(key, inf))
+        elif splits:
+            parts += [(sign, part, splits - 1) for part in _split(accused, near.laterals)]
     if not any_of(contested):
         return found
     out = identified(found.problems, by_model)
@@ -134,6 +147,16 @@ def _instead(  # noqa: PLR0917  # one explanation
                 yield float(_evidence(problem, each[None])[0]) + cost, both
                 kept.append(both)
     yield from zip(_evidence(problem, np.stack(kept)).tolist(), kept, strict=True)
+
+
+def _split(meters: Bools, laterals: Bools) -> tuple[Bools, ...]:
+    """Meters (p,) inside and outside of the lateral (g, p) with most of them, but not all; () for none."""
+    inside = np.count_nonzero(laterals & meters, axis=1)
+    inside[inside == np.count_nonzero(meters)] = 0
+    if not any_of(inside):
+        return ()
+    one = laterals[inside.argmax()]
+    return meters & one, meters & ~one
 
 
 def _without(chosen: Bools, meters: Bools) -> Bools:
@@ -182,6 +205,31 @@ class _Limited(_OneSign):
         counted = int(np.count_nonzero(self.inside & self.counted)) + sign * self.counted
         return np.where((self.count + sign > 0) & (counted <= self.room), fit, inf)
 
+    def descend(self) -> Self:
+        """Lower the cost by single meters and by exchanges until none of them helps."""
+        for _ in range(self.y.size):
+            super().descend()
+            out, into = np.flatnonzero(self.inside), np.flatnonzero(~self.inside)
+            if not out.size or not into.size:
+                break
+            fit = self._exchanged(out, into)
+            i, j = np.unravel_index(int(fit.argmin()), fit.shape)
+            if not fit[i, j] < self.cost - GAIN:
+                break
+            self.toggle(int(out[i]))
+            self.toggle(int(into[j]))
+        return self
+
+    def _exchanged(self, out: Ints, into: Ints) -> Floats:
+        """Cost after exchanging members `out` (n,) for others `into` (l,), (n, l)."""
+        own = self.F.diagonal()
+        a = self.a + np.subtract.outer(-self.y[out], -self.y[into])
+        b = self.b + np.add.outer(own[out] - 2.0 * self.rows[out], own[into] + 2.0 * self.rows[into])
+        b -= 2.0 * submatrix(self.F, out, into)
+        counted = int(np.count_nonzero(self.inside & self.counted))
+        more = np.subtract.outer(-self.counted[out].astype(np.intp), -self.counted[into].astype(np.intp))
+        return np.where(counted + more <= self.room, self.fit(a, b), inf)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Relaxed:
@@ -210,16 +258,20 @@ class _Relaxed:
         least, best = 0.0, np.zeros(self.y.size, dtype=np.bool_)
         if not best.size or self.room <= 0:
             return least, best
-        start = np.full(best.size, HALF)
+        start, tried = np.full(best.size, HALF), amount
         for _ in range(ROUNDS):
-            share, before = self._share(amount, start), least
+            share, before, now = self._share(amount, start), least, 0.0
             for inside in self._rounded(share):
                 end = _Limited(self, inside).descend()
                 if end.cost < least:
                     least, best, now = end.cost, end.inside, end.a / (end.b + 1.0 / self.s2)
             if not (least < before - WORTH and now > 0.0):
-                break
+                if share @ self.counted <= self.room:
+                    break
+                # Sets within the promise have larger amounts.
+                now = LARGER * tried
             start, amount = np.clip(share * amount / now, 0.0, 1.0), now
+            tried = max(tried, now)
         return least, best
 
     def _rounded(self, share: Floats) -> Iterator[Bools]:

@@ -483,7 +483,7 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     best = int(np.argmin(costs))
     if best:
         found = _searched(core, state, rows[best])
-    found = collusion.weighed(mirrors.reflected(found, core.near), state.masked.meters, core.near.most)
+    found = collusion.weighed(mirrors.reflected(found, core.near), state.masked.meters, core.near)
     return Suspicion(rows[best], found)
 
 

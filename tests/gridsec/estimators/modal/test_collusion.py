@@ -12,6 +12,7 @@ import pytest
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.modal import collusion
 from gridsec.estimators.modal.costs import SearchProblem, cost, costs, penalties
+from gridsec.estimators.modal.mirrors import Neighbourhoods
 from gridsec.estimators.modal.search import ALIKE, Identification
 from tests.gridsec.estimators.modal.test_search import problem
 
@@ -41,7 +42,14 @@ def explanation(given: SearchProblem, accused: Bools, *, power: bool = False) ->
 
 def contested(given: Identification, masked: Bools, most: int) -> Bools:
     """Named meters that other explanations replace, (p,)."""
-    return given.named & ~collusion.weighed(given, masked, most).named
+    return given.named & ~collusion.weighed(given, masked, near(most)).named
+
+
+def near(most: int) -> Neighbourhoods:
+    """The two laterals, halves of them, and one phase."""
+    laterals = np.repeat(np.eye(4, dtype=np.bool_), 3, axis=1)
+    whole = np.repeat(np.eye(2, dtype=np.bool_), 6, axis=1)
+    return Neighbourhoods(np.vstack([laterals, whole]), np.ones((METERS, 1), dtype=np.bool_), most)
 
 
 def some(*meters: int) -> Bools:
@@ -90,6 +98,22 @@ def test_the_set_with_one_amount_is_the_best_of_all(seed: int) -> None:
     assert np.isclose(least, min(exact(each) for each in every if 0 < each.sum() <= room))
 
 
+@pytest.mark.parametrize("amount", [0.1, 0.3])
+def test_a_relaxation_of_too_many_meters_is_solved_for_larger_amounts(amount: float) -> None:
+    """Seven of ten meters of a graded lateral: with the amounts given, the relaxation has more than seven."""
+    rng, p = np.random.default_rng(23), 20
+    V = 0.04 * np.eye(p) + 0.6 * np.ones((p, p))
+    V += 3.0 * np.kron(np.eye(2), np.outer(np.linspace(0.5, 1.5, 10), np.linspace(0.5, 1.5, 10)))
+    lie = np.isin(np.arange(p), rng.permutation(10)[:7])
+    F = np.linalg.inv(V)
+    y = F @ (0.8 * lie + np.linalg.cholesky(V) @ rng.standard_normal(p))
+    relaxed = collusion._Relaxed(y, F, 1.0, np.ones(p, dtype=np.bool_), 7)
+    assert relaxed._share(amount, np.full(p, 0.5)).sum() > 7.0
+    least, inside = relaxed.best(amount)
+    assert (inside == lie).all()
+    assert least == collusion._Limited(relaxed, lie).cost
+
+
 def test_an_honest_meter_amid_colluding_ones_is_contested() -> None:
     """Four of a lateral are off by 0.8: its two honest meters seem to be off by the reverse."""
     given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
@@ -107,6 +131,25 @@ def test_meters_that_nothing_replaces_are_named() -> None:
     assert not contested(explanation(given, some(0, 6)), NONE, 4).any()
     opposite = street(lie * np.where(some(6), -1.0, 1.0))
     assert not contested(explanation(opposite, some(0, 6)), NONE, 4).any()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_decoy_protects_no_honest_meter(seed: int) -> None:
+    """A meter of the other lateral is off by far more, in the direction in which the honest ones seem off."""
+    lie = 0.8 * some(0, 1, 2, 3) - 2.0 * some(8)
+    given = street(lie, seed)
+    assert (contested(explanation(given, some(4, 5, 8)), NONE, 5) == some(4, 5)).all()
+    assert not contested(explanation(street(-2.0 * some(2, 8), seed), some(2, 8)), NONE, 4).any()
+
+
+def test_a_split_is_by_the_lateral_with_most_of_the_meters() -> None:
+    """All in one half lateral, or one meter: no split by a lateral that has all."""
+    laterals = near(4).laterals
+    first, second = collusion._split(some(0, 2, 4, 7), laterals)
+    assert (first == some(0, 2, 4)).all()
+    assert (second == some(7)).all()
+    assert [each.nonzero()[0].tolist() for each in collusion._split(some(0, 4, 5), laterals)] == [[4, 5], [0]]
+    assert collusion._split(some(0, 2), laterals) == collusion._split(some(3), laterals) == ()
 
 
 def test_a_sole_fault_is_left_to_the_prior() -> None:
@@ -130,7 +173,7 @@ def test_nothing_named_is_not_contested() -> None:
     given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
     shown = explanation(given, some(4, 5))
     nothing = Identification(shown.chosen, shown.model, shown.weight, NONE, shown.problems)
-    assert collusion.weighed(nothing, NONE, 4) is nothing
+    assert collusion.weighed(nothing, NONE, near(4)) is nothing
 
 
 def test_a_false_power_beside_it_protects_no_manipulated_meter() -> None:
@@ -145,7 +188,7 @@ def test_a_false_power_beside_it_protects_no_manipulated_meter() -> None:
 def test_the_other_set_is_no_likelier_than_the_explanation() -> None:
     """It is reported behind the explanation, also where it fits better."""
     given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
-    out = collusion.weighed(explanation(given, some(4, 5)), NONE, 4)
+    out = collusion.weighed(explanation(given, some(4, 5)), NONE, near(4))
     assert (out.chosen[0, :METERS] == some(4, 5)).all()
     assert (out.chosen[1, :METERS] == some(0, 1, 2, 3)).all()
     assert out.weight[0] > out.weight[1] > 0.4
