@@ -24,6 +24,7 @@ from scipy.linalg import cholesky, solve_triangular
 from gridsec.arrays import Bools, Floats, Ints, any_of, indices
 from gridsec.errors import InputInvalid, Problem
 from gridsec.estimators.modal import (
+    classes,
     collusion,
     detector,
     full,
@@ -36,6 +37,7 @@ from gridsec.estimators.modal import (
 )
 from gridsec.estimators.modal import estimate as estimates
 from gridsec.estimators.modal import filter as modal
+from gridsec.estimators.modal.classes import Classes
 from gridsec.estimators.modal.costs import SearchProblem, cost
 from gridsec.estimators.modal.detector import SIZE, Detector, Evidence
 from gridsec.estimators.modal.estimate import Estimated, Estimator
@@ -69,8 +71,12 @@ LASTS = 0.2
 """Standard deviation of a lasting error along an unknown direction, in that of one tick of the filter, 1."""
 ADOPTED = 0.05
 """Largest weight of sets that need a meter where loads are adopted, 1: a meter may hide its own load."""
+LIKELY = 0.01
+"""Least weight of an explanation that the next search knows, 1: that of reported explanations."""
 CALM = 0.5
 """Part of the limit of log M below which suspected onsets are given up, 1."""
+EARLY = 64
+"""Ticks at the start, and from one comparison with the classes to the next: learning is slow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,6 +104,8 @@ class Core:
         Log gamma: the alarm is at log M >= limit.
     rivals
         Modes under other models of the loads.
+    classes
+        Own errors of the meters and their accuracy classes.
     """
 
     model: ResidualModel
@@ -110,6 +118,7 @@ class Core:
     bound: Floats = field(repr=False)
     limit: float
     rivals: tuple[Modes, ...] = field(repr=False)
+    classes: Classes = field(repr=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,6 +139,8 @@ class CoreState:
         Masked meters.
     rivals
         The model and its rivals since the start of the kept readings, with the likeliest pinned onset.
+    beyond
+        Log evidence against the accuracy classes when it was evaluated last; None before.
     """
 
     filter: FilterState
@@ -140,6 +151,7 @@ class CoreState:
     suspected: tuple[Suspected, ...]
     masked: Masked
     rivals: tuple[Rival, ...] = ()
+    beyond: float | None = None
 
 
 def assemble(
@@ -150,6 +162,7 @@ def assemble(
     gamma: float,
     attacked: int | None = None,
     inverters: tuple[Floats, Floats] | None = None,
+    allowed: Floats | None = None,
 ) -> Core:
     """Prepare a core.
 
@@ -167,6 +180,8 @@ def assemble(
         Largest number of manipulated meters that is promised; None: a third.
     inverters : (n, m), (m,)
         Effect of their injections on all places, squared pu per pu, and their ranges, pu; None: none.
+    allowed : (p,)
+        Largest fixed error within the class of each meter, squared pu; None: no bound.
 
     Raises
     ------
@@ -193,6 +208,7 @@ def assemble(
         bound=np.concatenate([np.full(at.size, inf), most, np.full(int(used.sum()), inf)]),
         limit=log(gamma),
         rivals=rivals.rivals(made),
+        classes=classes.classes(made, np.full(at.size, inf) if allowed is None else allowed),
     )
 
 
@@ -219,6 +235,7 @@ def design(front: SequentialDesign, most: Floats | None = None) -> Core:
         gamma=gamma,
         attacked=front.max_attacked,
         inverters=inverters if droop.customer.size else None,
+        allowed=front.allowed,
     )
 
 
@@ -291,6 +308,12 @@ def step(  # noqa: PLR0917  # the state, and one tick
     )
     if any_of(masked.meters) and after.full is not None:
         masked = masking.follow(made, masked, after.full, m, read)
+    beyond = state.beyond
+    if evidence.log_m > -inf:
+        if beyond is None or pinned or test.ticks <= EARLY or test.ticks % EARLY == 0:
+            beyond = classes.evidence(core.classes, made, after, known, ~masked.meters)
+        evidence = evidence.joined(test.onsets.oldest, beyond)
+        test = replace(test, log_m=evidence.log_m)
     suspected = state.suspected
     if update.exact is not None:
         if pinned and not suspected:
@@ -307,7 +330,7 @@ def step(  # noqa: PLR0917  # the state, and one tick
     elif pinned and evidence.log_m < CALM * core.limit:
         test, suspected, others = detector.pin(test, evidence.rows[:0]), (), ()
     history = replay.record(state.history, (after, known, test, suspected), m, seen, unknown)
-    return CoreState(after, known, test, update, history, suspected, masked, others), evidence
+    return CoreState(after, known, test, update, history, suspected, masked, others, beyond), evidence
 
 
 def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState, Evidence]:
@@ -398,7 +421,11 @@ def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
         joint = rival.joint()
         after = replace(after, full=replay.freed(rival.modes, whole, joint, W, std, loads=True))
     parts = after, rival.static, detector.start(core.modes)
-    return CoreState(*parts, rival.update, History((*parts, ())), (), state.masked)
+    beyond = classes.evidence(core.classes, core.modes, after, rival.static, ~state.masked.meters)
+    if beyond >= core.limit:
+        # No model of the loads explains an error beyond the class of a meter.
+        return state
+    return CoreState(*parts, rival.update, History((*parts, ())), (), state.masked, beyond=beyond)
 
 
 def doubted(found: Identification, meters: int) -> float:
@@ -458,7 +485,7 @@ class Suspicion:
     found: Identification
 
 
-def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
+def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion | None = None) -> Suspicion:
     """Sets of faults that explain the readings, since the onset that suits them best.
 
     The search is made at the onset that suits faults of all members best, under the model of the loads and
@@ -470,19 +497,23 @@ def identify(core: Core, state: CoreState, evidence: Evidence) -> Suspicion:
     ----------
     core, state, evidence
         The core, the state after a tick, and the answer of that tick.
+    before
+        What an earlier search found: its likely sets count in this one, too. None: none.
     """
-    test = state.detector
+    test, known = state.detector, None
+    if before is not None:
+        known = before.found.chosen[before.found.weight >= LIKELY]
     rows = [] if state.suspected else [int(evidence.rows[0])]
     rows = list(dict.fromkeys(rows + np.flatnonzero(test.pinned & test.onsets.used).tolist()))
     rows = sorted(rows, key=lambda row: _misfit(core, _joint(core, _parts(state), row)))
-    found = _searched(core, state, rows[0])
+    found = _searched(core, state, rows[0], known)
     std, costs = found.problems[0].std, []
     for row in rows:
         problem, gain = _problem(core, _joint(core, _parts(state), row), _unknown(state))
         costs.append(cost(replace(problem, std=std), found.chosen[0]) - 2.0 * gain)
     best = int(np.argmin(costs))
     if best:
-        found = _searched(core, state, rows[best])
+        found = _searched(core, state, rows[best], known)
     found = collusion.weighed(mirrors.reflected(found, core.near), state.masked.meters, core.near)
     return Suspicion(rows[best], found)
 
@@ -515,19 +546,19 @@ def _joint(core: Core, parts: Parts, row: int) -> Joint:
     return signatures.joint(core.modes, test.onsets, known, row)
 
 
-def _searched(core: Core, state: CoreState, row: int) -> Identification:
+def _searched(core: Core, state: CoreState, row: int, known: Bools | None) -> Identification:
     """Explanations since one onset, under the model and under its rivals."""
     open_ = _unknown(state)
     model, gain = _problem(core, _joint(core, _parts(state), row), open_)
     if not state.rivals:
-        return search(model, core.groups, (), core.near.laterals)
+        return search(model, core.groups, (), core.near.laterals, known)
     plain, others = state.rivals[0], state.rivals[1:]
     less = 2.0 * log(PRIOR * len(others) / (1.0 - PRIOR))
     found = []
     for each in others:
         problem, more = _problem(core, each.joint(), open_)
         found.append((problem, 2.0 * (plain.evidence + gain - each.evidence - more) + less))
-    return search(model, core.groups, found, core.near.laterals)
+    return search(model, core.groups, found, core.near.laterals, known)
 
 
 def _problem(core: Core, joint: Joint, unknown: Floats | None) -> tuple[SearchProblem, float]:

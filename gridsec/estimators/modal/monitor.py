@@ -30,7 +30,7 @@ from functools import partial
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, changed
-from gridsec.estimators.modal import core, doubts, full, masking, record, verdict
+from gridsec.estimators.modal import classes, core, doubts, full, masking, record, verdict
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.doubts import Unknown
@@ -96,6 +96,8 @@ SETTLING = 32
 """Largest number of ticks at the start of a run that the core gives up for complete readings."""
 JUMP = 6.0
 """Standard deviations of an innovation beyond which a reading does not drive an inverter, 1."""
+HELD = 8
+"""Ticks without a jump after which a reading that jumped is believed: log M is evaluated twice in them."""
 PAUSE = 60.0
 """Ticks without a frame that count as a pause for the time of commissioning."""
 
@@ -110,15 +112,10 @@ class ModalDesign:
         Design of the front end.
     core
         The statistical core.
-    own, own_of_modes : (p, p), (p, t)
-        Regression of the meters' own fixed errors on all errors that last, ``diag(fixed) B^-1``, and on their
-        modes.
     """
 
     front: SequentialDesign
     core: Core
-    own: Floats = field(repr=False)
-    own_of_modes: Floats = field(repr=False)
 
     @property
     def plant(self) -> Plant:
@@ -161,9 +158,7 @@ def design(
     `gridsec.estimators.sequential.design.design`, and its errors.
     """
     front = front_design(plant, doubt=doubt, step_s=step_s, options=options, max_attacked=max_attacked)
-    kernel = core.design(front, most)
-    own = np.asarray(np.linalg.solve(kernel.modes.covariance_b, np.diag(kernel.model.fixed)).T, np.float64)
-    return ModalDesign(front, kernel, own, own @ kernel.modes.back)
+    return ModalDesign(front, core.design(front, most))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,6 +183,8 @@ class ModalState:
         Number of the tick of the next search.
     kept
         Record of the learned errors; None before the first tick.
+    held : (p,)
+        Ticks for which a reading that jumped, and drove no inverter, leaves the verdict open.
     """
 
     front: SequentialState
@@ -198,6 +195,7 @@ class ModalState:
     inverters: Ints
     due: int
     kept: Record | None
+    held: Ints
 
     @property
     def attack_kinds(self) -> AttackKinds:
@@ -227,7 +225,7 @@ def init(design: ModalDesign, t: float, commission: Commission | None = None) ->
     p = kernel.modes.size
     counts = np.zeros(phases.std.size - p - phases.powers, dtype=np.intp)
     none, inverters = np.zeros(p, dtype=np.intp), np.zeros(design.plant.droop.tau.size, dtype=np.intp)
-    return ModalState(front, begun, None, none, counts, inverters, 0, before)
+    return ModalState(front, begun, None, none, counts, inverters, 0, before, none)
 
 
 def _begun(kernel: Core, before: Record | None, t: float) -> CoreState:
@@ -258,8 +256,12 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     uncertainty = update_uncertainty(
         front, given.uncertainty, frame, measured.available, measured.busbar_metered
     )
-    own = own_errors(design, state.core)
+    own, trusted = own_errors(design, state.core), given.trust.trusted
     given, measured, predicted = _driven(design, state, given, measured, uncertainty, own)
+    jumps = trusted & ~given.trust.trusted
+    held = state.held
+    if any_of(jumps) or any_of(held):
+        held = np.where(jumps, HELD, np.maximum(held - 1, 0))
     v2 = predicted.v2_bus[front.prior.meters]
     skew = given.clock_skew
     if skew is not None or frame.clock_offset is not None:
@@ -293,7 +295,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
         metered = np.asarray(measured.busbar_metered) & after.front.busbar.trusted
         measured = replace(measured, busbar_metered=metered if metered.size > 1 else bool(metered[0]))
         open_ = doubts.unknown(front, measured, uncertainty, predicted, skew)
-    tick = _Tick(measured, predicted, open_, evidence, m)
+    tick = _Tick(measured, predicted, open_, evidence, m, held)
     return _answered(design, after, tick)
 
 
@@ -349,6 +351,7 @@ class _Tick:
     unknown: Unknown | None
     evidence: Evidence
     m: Floats  # (p,) residuals, 0 without a reading
+    held: Ints  # (p,) ticks for which a reading that jumped leaves the verdict open
 
 
 def _begun_anew(design: ModalDesign, state: ModalState, t: float) -> CoreState:
@@ -380,7 +383,7 @@ def _identified(
         return _unsuspected(state), evidence
     if tick < state.due or not core.alarmed(kernel, evidence):
         return replace(state, suspicion=suspicion), evidence
-    suspicion = core.identify(kernel, state.core, evidence)
+    suspicion = core.identify(kernel, state.core, evidence, suspicion)
     named = suspicion.found.named & ~state.core.masked.meters
     streak = np.where(suspicion.found.chosen[0, : named.size], state.streak + 1, 0)
     phases = np.where(verdict.certain_phases(kernel, suspicion), state.phases + 1, 0)
@@ -508,6 +511,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         seen=seen,
         named=named,
         unread=np.zeros_like(seen) if tick.unknown is None else tick.unknown.unchecked,
+        jumps=tick.held > 0,
         evidence=evidence,
         suspected=suspected,
         explanations=rivals,
@@ -554,7 +558,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         learning=learning,
         last=(estimate, answer),
     )
-    out = changed(state, front=after, kept=kept or state.kept)
+    out = changed(state, front=after, kept=kept or state.kept, held=tick.held)
     return (out if learning is None else _learned(design, out)), estimate, answer
 
 
@@ -669,12 +673,8 @@ def own_errors(design: ModalDesign, state: CoreState) -> Floats:
     design, state
         The design, and the state of the core.
     """
-    whole, known, b = state.filter.full, state.static, state.filter.mean[1]
-    if whole is not None:
-        return np.asarray(design.own @ whole.mean[1])
-    if known.theta.size:
-        b = b + (1.0 - known.signature[1]) * (design.core.modes.directions @ known.theta)
-    return np.asarray(design.own_of_modes @ b)
+    kernel = design.core
+    return classes.means(kernel.classes, kernel.modes, state.filter, state.static)
 
 
 def _attack(design: ModalDesign, state: ModalState, tick: _Tick, estimate: Estimate, named: Bools) -> Floats:
@@ -769,11 +769,8 @@ def _learned(design: ModalDesign, state: ModalState) -> ModalState:
 
 def _errors(design: ModalDesign, state: ModalState, done: Bools) -> Learned:
     """Fixed errors of the filter, for the meters `done` (p,)."""
-    front, modes, known, kernel = design.front, design.core.modes, state.front.learned, state.core
-    whole = kernel.filter.full or full.expanded(modes, kernel.filter, kernel.static)
-    B, P = modes.covariance_b, whole.blocks[2]
-    fixed = design.core.model.fixed
-    variance = np.clip(fixed - ((design.own @ (B - P)) * design.own).sum(axis=1), 0.0, front.fixed)
+    front, known, kernel = design.front, state.front.learned, state.core
+    variance = classes.variances(design.core.classes, design.core.modes, kernel.filter, kernel.static)
     aging = front.options.stability * (front.allowed - front.rounded)
     allowed = np.minimum(aging + 3.0 * np.sqrt(variance) + front.rounded, front.allowed)
     bias = np.clip(own_errors(design, kernel), -front.allowed, front.allowed)
@@ -789,7 +786,7 @@ def _errors(design: ModalDesign, state: ModalState, done: Bools) -> Learned:
 def renew(design: ModalDesign, state: ModalState, which: Bools) -> ModalState:
     """State after meters `which` (p,) were replaced: trusted again, with their errors to be learned.
 
-    With K of `ModalDesign.own`, a meter's own error is ``K b + r``, r independent of readings. A new error
+    With K of `classes`, a meter's own error is ``K b + r``, r independent of readings. A new error
     in its place gives, with A the identity less the rows K of the replaced meters,
 
         b <- A b,   cov b <- A cov b A' + 2 diag(fixed) - K B K'     in their rows and columns.
@@ -802,7 +799,7 @@ def renew(design: ModalDesign, state: ModalState, which: Bools) -> ModalState:
     )
     whole = kernel.filter.full or full.expanded(modes, kernel.filter, kernel.static)
     t, at = modes.size, np.flatnonzero(which)
-    A, K = np.eye(2 * t), design.own[at]
+    A, K = np.eye(2 * t), design.core.classes.own[at]
     A[t + at, t:] -= K
     cov, fixed = A @ whole.cov @ A.T, design.core.model.fixed[at]
     cov[np.ix_(t + at, t + at)] += 2.0 * np.diag(fixed) - K @ modes.covariance_b @ K.T
@@ -833,7 +830,7 @@ def renew(design: ModalDesign, state: ModalState, which: Bools) -> ModalState:
         trust=state.front.trust.replaced(which),
     )
     zero = 0 * state.streak, 0 * state.phases, 0 * state.inverters
-    return ModalState(now, begun, None, *zero, 0, record.made(modes, opened, kernel.static))
+    return ModalState(now, begun, None, *zero, 0, record.made(modes, opened, kernel.static), zero[0])
 
 
 def progress(design: ModalDesign, commission: Commission) -> LearningProgress:

@@ -187,6 +187,7 @@ def search(
     groups: tuple[Ints, ...] = (),
     rivals: Sequence[tuple[SearchProblem, float]] = (),
     laterals: Bools | None = None,
+    known: Bools | None = None,
 ) -> Identification:
     """Find the likeliest sets and the meters without which nothing explains the readings.
 
@@ -200,6 +201,8 @@ def search(
         The problem under other models of the loads, and the cost of each by itself.
     laterals : (G, p)
         Members of the laterals that may be manipulated as a whole; None: none.
+    known : (k, q)
+        More sets that count, as those of an earlier search, which descents may miss; None: none.
     """
     batches = together(groups)
     read = informed(problem)
@@ -222,6 +225,8 @@ def search(
         else:
             met = {end.chosen.tobytes(): end.cost}
             _with_amounts_alike(end.problem, met, sets[:1])
+        if known is not None:
+            _recalled(end.problem, met, known)
         keys = list(met)
         less = excess(np.stack([np.frombuffer(key, dtype=np.bool_) for key in keys]), whole, read)
         found.append({key: met[key] + cost - float(one) for key, one in zip(keys, less, strict=True)})
@@ -295,6 +300,19 @@ def _with_amounts_alike(problem: SearchProblem, found: dict[bytes, float], more:
         both = mean_likelihood(np.stack([own, costs(problem, sets[several], ALIKE)]))
         for k, cost in zip(several, both.tolist(), strict=True):
             found[keys[k]] = cost
+
+
+def _recalled(problem: SearchProblem, found: dict[bytes, float], known: Bools) -> None:
+    """Add sets of an earlier search, (k, q), each with the prior size that suits it, if that is cheaper.
+
+    The size of the problem is that of the best set. It speaks against sets of far larger or smaller amounts.
+    """
+    for chosen in known:
+        own, one = _sized(problem, chosen), chosen[None]
+        alike = ALIKE if np.count_nonzero(chosen[: problem.meters]) > 1 else 0.0
+        each = np.stack([[costs(size, one, share) for share in (0.0, alike)] for size in (problem, own)])
+        least = float(mean_likelihood(each.transpose(1, 0, 2)).min())
+        found[chosen.tobytes()] = min(least, found.get(chosen.tobytes(), inf))
 
 
 def _best(starts: tuple[Tableau, ...], groups: Groups) -> Tableau:

@@ -223,7 +223,7 @@ def _row(state: CoreState, evidence: Evidence, suspicion: Suspicion | None) -> i
         of_meters = np.where(onsets.used, evidence.by_row[0], -inf)
         if of_meters.max() > -inf:
             return int(of_meters.argmax())
-    return int(np.where(onsets.used & ~onsets.ramp, onsets.age, -1).argmax())
+    return onsets.oldest
 
 
 # --- Explanations ---
@@ -357,6 +357,8 @@ class Inputs:
         The frame.
     seen, named, unread : (p,)
         Meters with a reading, named ones, and those with a reading that no known power checks.
+    jumps : (p,)
+        Readings that jump, and therefore drive no inverter, or did so a few ticks ago.
     evidence
         Evidence of the meters.
     suspected
@@ -377,6 +379,7 @@ class Inputs:
     seen: Bools
     named: Bools
     unread: Bools
+    jumps: Bools
     evidence: MeterEvidence
     suspected: bool
     explanations: tuple[Explanation, ...]
@@ -419,6 +422,7 @@ def verdict(design: SequentialDesign, now: Inputs, estimate: Estimate) -> Findin
     finding = _busbar(design, now, estimate, finding)
     if now.suspected:
         finding = _suspected(design, now, finding)
+    finding = _jumping(design, now, finding)
     finding = _inverters(design, now, finding)
     return _clock(design, now, tested, _unread_powers(design, now, estimate, finding))
 
@@ -504,6 +508,15 @@ def _suspected(design: SequentialDesign, now: Inputs, finding: Finding) -> Findi
         parts = explanations_sentence(design, some).removesuffix("; nothing else explains the readings.")
         return Decision.UNDECIDED, Cause.AMBIGUOUS, f"{parts}, or loads that no reading shows."
     return Decision.UNDECIDED, Cause.AMBIGUOUS, explanations_sentence(design, some)
+
+
+def _jumping(design: SequentialDesign, now: Inputs, finding: Finding) -> Finding:
+    """UNDECIDED where inverters do without readings that jump: their injections may hide a manipulation."""
+    if finding[1] not in (Cause.AGREEMENT, Cause.SILENT_METERS) or not any_of(now.jumps):
+        return finding
+    meters = ", ".join(design.names[j] for j in np.flatnonzero(now.jumps))
+    sentence = f"Readings jump and drive no inverter until they agree with the feeder again: {meters}."
+    return Decision.UNDECIDED, Cause.MISFIT, sentence
 
 
 def _accuses(explanation: Explanation) -> bool:

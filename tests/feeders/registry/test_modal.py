@@ -253,7 +253,7 @@ def test_a_replaced_meter_is_trusted_again_with_an_unknown_error() -> None:
     whole = kernel.filter.full or full.expanded(modes, kernel.filter, kernel.static)
     t, j = modes.size, int(LIARS[0])
     # States (w, b, own error of j): own = K b + r, then b_j loses it and gains a new one.
-    K, fixed = made.own[[j]], made.core.model.fixed[j]
+    K, fixed = made.core.classes.own[[j]], made.core.model.fixed[j]
     rest = float(fixed - (K @ modes.covariance_b @ K.T)[0, 0])
     L = np.vstack([np.eye(2 * t), np.hstack([np.zeros((1, t)), K])])
     joint = L @ whole.cov @ L.T

@@ -1,0 +1,141 @@
+"""Fixed errors of single meters, and evidence that one of them exceeds its accuracy class.
+
+The errors that last are ``b = c + H x``: own errors c of the meters, ``c_j ~ N(0, phi_j)``, and the error x
+of the busbar's meter at its phases H. With ``K = diag(phi) B^-1`` the own errors are ``c = K b + r``, r
+independent of b and of all readings, so that their posterior means and variances are
+
+    m = K E b,    v = phi - diag(K (B - P) K'),    P = cov b
+
+**Class.** A Gaussian prior is a description of many meters. It allows one meter six standard deviations, and
+the filter learns such a lie within minutes, if it begins with the first reading. An accuracy class is a
+bound: ``|c_j| <= a_j``. What the readings alone say of c_j is a Gaussian likelihood L with the information G
+and the score g,
+
+    G = 1 / v - 1 / phi,    g = m / v,    log L(c) = g c - G c^2 / 2
+
+and for any own error within the class, as constant as it may be,
+
+    Lambda_j = integral L(c) N(c; 0, s^2) dc / max over |c| <= a_j of L(c)
+
+has a mean of at most 1 at every tick: the denominator is at least L of the true error [1]_. With
+G = 1 / sigma^2 and c^ = g / G,
+
+    2 log Lambda_j = (|c^| - a)+^2 / sigma^2 - c^2 / (sigma^2 + s^2) - log(1 + s^2 / sigma^2)
+
+The mean of the Lambda over the meters is evidence against the classes, worth one unit of capital of
+`gridsec.estimators.modal.detector` at the start. Other errors have the model's distributions.
+
+References
+----------
+.. [1] Wasserman, Ramdas and Balakrishnan, Universal inference, PNAS 117, 2020.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import inf, log
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, any_of
+from gridsec.estimators.modal.detector import SIZE
+from gridsec.estimators.modal.filter import FilterState
+from gridsec.estimators.modal.model import Modes
+from gridsec.estimators.modal.static import Static
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Classes:
+    """Regression of the meters' own errors on all errors that last. p meters, t modes.
+
+    Attributes
+    ----------
+    own, of_modes : (p, t)
+        K, and K on the modes.
+    fixed, allowed : (p,)
+        phi, squared pu^2, and a, squared pu; infinite for no bound.
+    unseen : (p,)
+        Variance that no knowledge of b takes away, ``phi - diag(K B K')``, squared pu^2.
+    """
+
+    own: Floats = field(repr=False)
+    of_modes: Floats = field(repr=False)
+    fixed: Floats
+    allowed: Floats
+    unseen: Floats
+
+
+def classes(modes: Modes, allowed: Floats) -> Classes:
+    """Prepare the own errors of the members; O(t^3).
+
+    Parameters
+    ----------
+    modes
+        The modes.
+    allowed : (t,)
+        Largest fixed error within the class of each member, squared pu; infinite for no bound.
+    """
+    fixed = modes.model.fixed[modes.at]
+    own = np.asarray(np.linalg.solve(modes.covariance_b, np.diag(fixed)).T, np.float64)
+    unseen = fixed - ((own @ modes.covariance_b) * own).sum(axis=1)
+    return Classes(own, own @ modes.back, fixed, allowed, np.maximum(unseen, 0.0))
+
+
+def means(made: Classes, modes: Modes, state: FilterState, static: Static) -> Floats:
+    """Posterior means of the own errors, (p,), squared pu at 1 pu.
+
+    Parameters
+    ----------
+    made, modes
+        The own errors, and the modes.
+    state, static
+        The filter after the last tick, and the information about the directions.
+    """
+    if state.full is not None:
+        return np.asarray(made.own @ state.full.mean[1])
+    b = state.mean[1]
+    if static.theta.size:
+        b = b + (1.0 - static.signature[1]) * (modes.directions @ static.theta)
+    return np.asarray(made.of_modes @ b)
+
+
+def variances(made: Classes, modes: Modes, state: FilterState, static: Static) -> Floats:
+    """Posterior variances of the own errors, (p,), squared pu^2; O(p t), and O(p t^2) with a full covariance.
+
+    Parameters
+    ----------
+    made, modes, state, static
+        As in `means`.
+    """
+    if state.full is not None:
+        known = ((made.own @ state.full.blocks[2]) * made.own).sum(axis=1)
+        return np.asarray(np.minimum(made.unseen + known, made.fixed))
+    known = (made.of_modes * made.of_modes) @ state.cov[2]
+    if static.theta.size:
+        moved = made.of_modes @ ((1.0 - static.signature[1])[:, None] * modes.directions)
+        known += ((moved @ static.cov) * moved).sum(axis=1)
+    return np.asarray(np.minimum(made.unseen + known, made.fixed))
+
+
+def evidence(made: Classes, modes: Modes, state: FilterState, static: Static, counted: Bools) -> float:
+    """Logarithm of the mean of Lambda over all meters; -inf without a bound.
+
+    Parameters
+    ----------
+    made, modes, state, static
+        As in `means`.
+    counted : (p,)
+        Meters that count; the others have Lambda = 0.
+    """
+    counted = counted & (made.allowed < inf) & (made.fixed > 0.0)
+    if not any_of(counted):
+        return -inf
+    m, v = means(made, modes, state, static), variances(made, modes, state, static)
+    m, v, phi, a = m[counted], v[counted], made.fixed[counted], made.allowed[counted]
+    # At least rounding: a meter that no reading informs about has none.
+    G = np.maximum(1.0 / v - 1.0 / phi, np.finfo(np.float64).eps / phi)
+    g, wider = m / v, 1.0 + SIZE**2 * G
+    beyond = np.maximum(np.abs(g) - a * G, 0.0)
+    each = 0.5 * ((beyond * beyond - g * g / wider) / G - np.log(wider))
+    top = float(each.max())
+    return top + log(float(np.exp(each - top).sum()) / made.fixed.size)

@@ -1,0 +1,164 @@
+"""Own errors of the meters against batch regression, and evidence against their accuracy classes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf, log
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from benchmarks._residuals import Source
+from gridsec.arrays import Bools, Floats
+from gridsec.estimators.modal import classes, core, full, static
+from gridsec.estimators.modal import filter as modal
+from gridsec.estimators.modal.detector import SIZE
+from gridsec.estimators.modal.filter import FilterState
+from gridsec.estimators.modal.model import Modes, ResidualModel, modes
+from gridsec.estimators.modal.static import Static
+from tests.gridsec.estimators.modal.test_core import LIAR, MODEL
+from tests.gridsec.estimators.modal.test_filter import mixed
+
+METERS, TICKS = 12, 15
+ALL = np.ones(METERS, dtype=np.bool_)
+ALLOWED = np.sqrt(3.0 * MODEL.fixed)
+"""Half-width of a uniform error with the variance of the model."""
+
+
+def batch(model: ResidualModel, m: Floats, seen: Bools) -> tuple[Floats, Floats]:
+    """Means and variances of the own errors given all readings (k, p), by one Gaussian regression."""
+    at, k = np.arange(METERS), len(m)
+    S, H, phi = model.loads(at), model.phases(at), model.fixed
+    lag = np.abs(np.subtract.outer(np.arange(k), np.arange(k)))
+    lasting = np.diag(phi) + model.busbar * (H @ H.T)
+    V = np.kron(np.exp(-lag / model.time_s), S) + np.kron(np.ones((k, k)), lasting)
+    V += np.kron(np.eye(k), model.noise(at))
+    C, kept = np.tile(np.diag(phi), k)[:, seen.ravel()], seen.ravel()
+    gain = np.linalg.solve(V[np.ix_(kept, kept)], C.T).T
+    return gain @ m.ravel()[kept], phi - (gain * C).sum(axis=1)
+
+
+def followed(model: ResidualModel, m: Floats, seen: Bools) -> tuple[Modes, FilterState, Static]:
+    """The exact filter after these readings."""
+    made = modes(model)
+    state, known = modal.start(made, 0.0), static.start(made)
+    for k, (each, read) in enumerate(zip(m, seen, strict=True)):
+        state, known, _ = full.step(made, state, known, float(k), each, None if read.all() else read)
+    return made, state, known
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3])
+@pytest.mark.parametrize("model", [replace(MODEL, fixed_s=inf), replace(mixed(METERS), fixed_s=inf)])
+def test_own_errors_equal_those_of_batch_regression(model: ResidualModel, share: float) -> None:
+    """Complete and missing readings, one class and two, a busbar's meter with an error of its own."""
+    random = np.random.default_rng(4)
+    m, seen = 0.01 * random.standard_normal((TICKS, METERS)), random.random((TICKS, METERS)) >= share
+    made, state, known = followed(model, m, seen)
+    # With many directions N is computed anew only where refinements do not suffice.
+    known = static.current(made, known) if state.full is None else known
+    own, (mean, variance) = classes.classes(made, ALLOWED), batch(model, m, seen)
+    np.testing.assert_allclose(classes.means(own, made, state, known), mean, atol=1e-9 * np.abs(mean).max())
+    np.testing.assert_allclose(classes.variances(own, made, state, known), variance, rtol=1e-7)
+
+
+@pytest.mark.parametrize("scale", [0.2, 1.0, 3.0])
+def test_the_evidence_is_that_of_numerical_integration(scale: float) -> None:
+    """The likelihood of each own error has the prior of the filter taken out."""
+    source = Source(MODEL, np.random.default_rng(2))
+    m = scale * np.stack([source.tick() for _ in range(TICKS)])
+    made, state, known = followed(MODEL, m, np.ones_like(m, dtype=np.bool_))
+    own = classes.classes(made, ALLOWED)
+    mean, v = (f(own, made, state, known) for f in (classes.means, classes.variances))
+    every = []
+    for j in range(METERS):
+        phi, a = MODEL.fixed[j], ALLOWED[j]
+        G, g = 1.0 / v[j] - 1.0 / phi, mean[j] / v[j]
+        most = g * np.clip(g / G, -a, a) - 0.5 * G * np.clip(g / G, -a, a) ** 2
+
+        def density(c: float, G: float = G, g: float = g, most: float = most) -> float:
+            whole = g * c - 0.5 * G * c * c - most - 0.5 * (c / SIZE) ** 2
+            return float(np.exp(whole) / (SIZE * np.sqrt(2.0 * np.pi)))
+
+        near = g / G, 8.0 / np.sqrt(G)
+        every.append(quad(density, near[0] - near[1], near[0] + near[1], epsrel=1e-10)[0])
+    found = classes.evidence(own, made, state, known, ALL)
+    assert found == pytest.approx(log(np.mean(every)), abs=1e-6)
+    some = np.arange(METERS) < 5
+    assert classes.evidence(own, made, state, known, some) == pytest.approx(
+        log(np.sum(every[:5]) / METERS), abs=1e-6
+    )
+
+
+def test_errors_within_the_classes_are_no_evidence() -> None:
+    """Mean of exp(evidence) over drawn runs with every own error at its bound: at most 1."""
+    random, found = np.random.default_rng(7), []
+    for seed in range(200):
+        source = Source(MODEL, np.random.default_rng([seed, 3]))
+        source.b = ALLOWED * random.choice([-1.0, 1.0], METERS)
+        m = np.stack([source.tick() for _ in range(4)])
+        made, state, known = followed(MODEL, m, np.ones_like(m, dtype=np.bool_))
+        found.append(classes.evidence(classes.classes(made, ALLOWED), made, state, known, ALL))
+    assert 0.0 < np.exp(found).mean() <= 1.0
+    assert max(found) < log(1e3)
+
+
+def test_without_a_bound_there_is_no_evidence() -> None:
+    """No class, no meter that counts, or perfect meters."""
+    made, state, known = followed(MODEL, np.ones((3, METERS)), np.ones((3, METERS), dtype=np.bool_))
+    own = classes.classes(made, np.full(METERS, inf))
+    assert classes.evidence(own, made, state, known, ALL) == -inf
+    assert classes.evidence(classes.classes(made, ALLOWED), made, state, known, ~ALL) == -inf
+    with_a = replace(own, allowed=ALLOWED, fixed=np.zeros(METERS))
+    assert classes.evidence(with_a, made, state, known, ALL) == -inf
+
+
+def test_a_meter_without_readings_is_no_evidence() -> None:
+    """Its own error has the prior's variance."""
+    seen = np.ones((TICKS, METERS), dtype=np.bool_)
+    seen[:, 3] = False
+    source = Source(MODEL, np.random.default_rng(2))
+    made, state, known = followed(MODEL, np.stack([source.tick() for _ in range(TICKS)]), seen)
+    own, three = classes.classes(made, ALLOWED), np.arange(METERS) == 3
+    assert classes.variances(own, made, state, known)[3] == pytest.approx(MODEL.fixed[3])
+    assert -log(METERS) - 1e-3 <= classes.evidence(own, made, state, known, three) <= -log(METERS)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2])
+def test_a_lie_from_the_first_reading_on_is_alarmed(share: float) -> None:
+    """One meter is off by three classes, 5.2 standard deviations of the prior: the filter learns it."""
+    powers = np.zeros((13, METERS))
+    bound, free = (
+        core.assemble(MODEL, powers, np.full(METERS, 0.1), gamma=1e6, allowed=each)
+        for each in (ALLOWED, None)
+    )
+    lie, alarmed = 3.0 * ALLOWED * (np.arange(METERS) == LIAR), {}
+    for name, kernel in (("bound", bound), ("free", free)):
+        source, random = Source(MODEL, np.random.default_rng(5)), np.random.default_rng(6)
+        source.b = ALLOWED * random.uniform(-1.0, 1.0, METERS) * (np.arange(METERS) != LIAR)
+        state, alarmed[name] = core.init(kernel, 0.0), []
+        for k in range(200):
+            seen = random.random(METERS) >= share
+            state, evidence = core.step(kernel, state, float(k), source.tick() + lie, seen)
+            alarmed[name].append(core.alarmed(kernel, evidence))
+    assert all(alarmed["bound"][60:])
+    assert not any(alarmed["free"][60:])
+
+
+def test_loads_are_adopted_only_where_they_explain_the_classes() -> None:
+    """Without a bound the same explanation, no fault, is adopted."""
+    powers = np.zeros((13, METERS))
+    source, lie = Source(MODEL, np.random.default_rng(5)), 2.5 * ALLOWED * (np.arange(METERS) % 2)
+    kernel = core.assemble(MODEL, powers, np.full(METERS, 0.1), gamma=1e6, allowed=ALLOWED)
+    state = core.init(kernel, 0.0)
+    for k in range(100):
+        state, evidence = core.step(kernel, state, float(k), source.tick() + lie)
+    suspicion = core.identify(kernel, state, evidence)
+    found = suspicion.found
+    none = replace(
+        found, chosen=np.zeros_like(found.chosen[:1]), weight=np.ones(1), model=found.model[:1], named=~ALL
+    )
+    suspicion = replace(suspicion, found=none)
+    assert core.adopt(kernel, state, suspicion) is state
+    free = replace(kernel, classes=replace(kernel.classes, allowed=np.full(METERS, inf)))
+    assert core.adopt(free, state, suspicion) is not state
