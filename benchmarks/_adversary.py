@@ -65,9 +65,9 @@ class World:
     @property
     def monitor(self) -> DesignedEstimator:
         """The default monitor, without commissioning of its own."""
-        return (
-            _aged_watcher(self.setting.feeder) if self.aged else watcher(self.setting.feeder, Model.MATCHED)
-        )
+        if self.aged:
+            return _designed(self, SEQUENTIAL)
+        return watcher(self.setting.feeder, Model.MATCHED)
 
     def frames(self, duration_s: float) -> Iterator[tuple[Frame, Floats]]:
         """Honest frames and true squared voltages, (N,), from `START` on."""
@@ -87,13 +87,6 @@ def _aged(feeder: str) -> Site:
     tables = site(feeder).tables
     meters = replace(tables.meta.meters, p_interval_s=LATE_S)
     return from_tables(replace(tables, meta=replace(tables.meta, meters=meters)))
-
-
-@lru_cache(maxsize=8)
-def _aged_watcher(feeder: str) -> DesignedEstimator:
-    tables = _aged(feeder).tables
-    settings = replace(tables.meta.monitor, estimator=SEQUENTIAL, commission_s=0.0, tick_s=1.0)
-    return design(from_tables(replace(tables, meta=replace(tables.meta, monitor=settings))))
 
 
 def _with_late_powers(where: Site, frame: Frame, old: Frame) -> Frame:
@@ -130,17 +123,15 @@ class Registered:
     """
 
     def __init__(self, name: str, world: World) -> None:
-        self.name, self.feeder = name, world.setting.feeder
-        self.design = world.monitor if name == SEQUENTIAL else _other(name, world)
+        self.name, self.world = name, world
+        self.design = world.monitor if name == SEQUENTIAL else _designed(world, name)
 
     def start(self, learning: Iterable[Frame]) -> Any:
         """State before the first frame, with the errors learned by the frames of the learning run, if any."""
         frames, by = list(learning), self.design.family.bias_learning
         if not frames or by is None:
             return self.design.init(START)
-        made = watcher(
-            self.feeder, Model.MATCHED, step_s=LEARN_STEP_S, commission_s=LEARN_S, estimator=self.name
-        )
+        made = _designed(self.world, self.name, LEARN_STEP_S, LEARN_S)
         state = made.init(START - LEARN_S - 2.0 * LEARN_STEP_S)
         for frame in frames:
             state, _, _ = made.step(state, frame)
@@ -152,9 +143,10 @@ class Registered:
         return state, Answer(estimate_.v2, verdict.decision, verdict.suspects)
 
 
-def _other(name: str, world: World) -> DesignedEstimator:
+def _designed(world: World, name: str, tick_s: float = 1.0, commission_s: float = 0.0) -> DesignedEstimator:
+    """Estimator for the world as its files state it."""
     tables = world.site.tables
-    settings = replace(tables.meta.monitor, estimator=name, commission_s=0.0, tick_s=1.0)
+    settings = replace(tables.meta.monitor, estimator=name, commission_s=commission_s, tick_s=tick_s)
     return design(from_tables(replace(tables, meta=replace(tables.meta, monitor=settings))))
 
 
