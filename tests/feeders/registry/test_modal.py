@@ -17,7 +17,7 @@ from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.arrays import Floats
 from gridsec.attack import Attack, Scaling
 from gridsec.errors import NotObservable
-from gridsec.estimators.modal import full, monitor
+from gridsec.estimators.modal import full, monitor, verdict
 from gridsec.interface import Cause, Decision, Estimate, Frame, PowerOrigin, Verdict
 
 ONSET, LIARS, LIE = 40, np.array([2, 5, 9]), 0.02
@@ -242,6 +242,28 @@ def test_learned_errors_and_named_meters_survive_a_restart() -> None:
     begun = monitor.warm_start(made, watcher().init(frames[ONSET + 5].t, known), before)
     _, _, verdicts = run(frames[ONSET + 5 :], begun)
     assert {frozenset(named(verdict)) for verdict in verdicts} == {frozenset(LIARS.tolist())}
+
+
+def test_a_reading_that_jumps_and_drives_no_inverter_leaves_the_verdict_open() -> None:
+    """Eight standard deviations at one tick, with a limit of the detector that this does not reach."""
+    frames, _ = played(0.0)
+    made = watcher().design
+    assert isinstance(made, monitor.ModalDesign)
+    made = replace(made, core=replace(made.core, limit=3.0 * made.core.limit))
+    j, state, decisions = int(made.front.meter_of.max()), monitor.init(made, frames[0].t), {}
+    for k, frame in enumerate(frames):
+        given = frame
+        if k == ONSET:
+            std = verdict.deviations(made.core, state.core, np.zeros(frame.y.size))[1][j]
+            given = replace(frame, y=frame.y + 8.0 * std * np.eye(frame.y.size)[j])
+        state, _, answer = monitor.step(made, state, given)
+        decisions[k] = answer
+    last = ONSET + monitor.HELD
+    assert {decisions[k].decision for k in range(20, ONSET)} == {Decision.CLEAN}
+    for k in range(ONSET, last):
+        assert (decisions[k].decision, decisions[k].cause) == (Decision.UNDECIDED, Cause.MISFIT)
+        assert decisions[k].reason.endswith(f"again: {made.front.names[j]}.")
+    assert decisions[last].decision is Decision.CLEAN
 
 
 def test_a_replaced_meter_is_trusted_again_with_an_unknown_error() -> None:

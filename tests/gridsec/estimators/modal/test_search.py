@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from math import comb
 
@@ -105,3 +106,23 @@ def test_amounts_that_become_impossible_are_removed() -> None:
     end = s.descend(tableau)
     amount = amounts(tight, end.chosen)[0]
     assert (np.abs(amount) <= tight.bound[end.chosen]).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_set_of_an_earlier_search_counts_with_the_size_that_suits_it(seed: int) -> None:
+    """Sets with one meter and with three that no descent meets, beside a problem with a far smaller size."""
+    given = replace(problem(seed, liars=3), std=np.concatenate([np.full(8, 0.05), np.ones(2)]))
+    known = np.array([[0, 0, 0, 1, 0, 0, 0, 0, 0, 0], [1, 0, 1, 0, 1, 0, 0, 0, 0, 1]], dtype=np.bool_)
+    found: dict[bytes, float] = {known[0].tobytes(): 1e6}
+    s._recalled(given, found, known)
+    for chosen in known:
+        mean, cov = amounts(given, chosen)
+        count = int(chosen[:8].sum())
+        size = float(np.sqrt(np.mean((mean**2 + np.diag(cov))[:count])))
+        suited = replace(given, std=np.concatenate([np.full(8, size), np.ones(2)]))
+        assert found[chosen.tobytes()] == pytest.approx(min(total(given, chosen), total(suited, chosen)))
+        assert total(suited, chosen) < total(given, chosen)
+    kept = s.search(given, known=known)
+    every = {each.tobytes() for each in kept.chosen}
+    likely = min(found.values()) < -2.0 * np.log(s.BELIEVED) + total(kept.problems[0], kept.chosen[0])
+    assert not likely or min(found, key=lambda key: found[key]) in every
