@@ -85,7 +85,7 @@ from gridsec.planning.unavoidable import (
 )
 
 FEEDERS = ("simbench-lv-rural1", "kerber-dorfnetz", "kerber-vorstadtnetz")
-SHARES = (0.6, 0.8, 1.0, 1.3, 2.0)
+SHARES = (0.1, 0.3, 0.6, 0.8, 1.0, 1.3, 2.0)
 """Parts of every limit: at 1, honest residuals decide; beyond, the first ticks before a mean is full."""
 CALM, TICKS = 20, 120
 """Honest ticks before an attack and ticks of an attack: twice the longest scale."""

@@ -1,4 +1,4 @@
-"""Fixed errors of single meters, and evidence that one of them exceeds its accuracy class.
+"""Fixed errors of single meters, and those that exceed their accuracy class.
 
 The errors that last are ``b = c + H x``: own errors c of the meters, ``c_j ~ N(0, phi_j)``, and the error x
 of the busbar's meter at its phases H. With ``K = diag(phi) B^-1`` the own errors are ``c = K b + r``, r
@@ -22,8 +22,10 @@ G = 1 / sigma^2 and c^ = g / G,
 
     2 log Lambda_j = (|c^| - a)+^2 / sigma^2 - c^2 / (sigma^2 + s^2) - log(1 + s^2 / sigma^2)
 
-The mean of the Lambda over the meters is evidence against the classes, worth one unit of capital of
-`gridsec.estimators.modal.detector` at the start. Other errors have the model's distributions.
+A meter exceeds its class where ``Lambda_j >= p gamma``. By a union over the p meters, and with Ville's
+inequality, that happens by chance in at most one of gamma starts, as long as the other errors have the
+model's distributions. With an enlarged covariance, after missing readings and restarts, Lambda is
+approximate. The comparison is beside the detector: it says nothing about an onset.
 
 References
 ----------
@@ -42,6 +44,12 @@ from gridsec.estimators.modal.detector import SIZE
 from gridsec.estimators.modal.filter import FilterState
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.static import Static
+
+KNOWN = 0.5
+"""Part of the prior variance below which an own error counts, 1.
+
+An enlarged covariance of the filter, as after missing readings, inflates the score of a hardly known one.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,25 +125,39 @@ def variances(made: Classes, modes: Modes, state: FilterState, static: Static) -
     return np.asarray(np.minimum(made.unseen + known, made.fixed))
 
 
-def evidence(made: Classes, modes: Modes, state: FilterState, static: Static, counted: Bools) -> float:
-    """Logarithm of the mean of Lambda over all meters; -inf without a bound.
+def exceeding(  # noqa: PLR0917  # the filter, and the meters with the limit
+    made: Classes, modes: Modes, state: FilterState, static: Static, counted: Bools, limit: float
+) -> Bools:
+    """Meters with an own error beyond their class, (p,).
 
     Parameters
     ----------
     made, modes, state, static
         As in `means`.
     counted : (p,)
-        Meters that count; the others have Lambda = 0.
+        Meters that are compared.
+    limit
+        log gamma.
     """
-    counted = counted & (made.allowed < inf) & (made.fixed > 0.0)
+    return log_lambda(made, modes, state, static, counted) >= limit + log(made.fixed.size)
+
+
+def log_lambda(made: Classes, modes: Modes, state: FilterState, static: Static, counted: Bools) -> Floats:
+    """Logarithm of Lambda of each meter, (p,); -inf without a bound, and for a hardly known own error.
+
+    Parameters
+    ----------
+    made, modes, state, static, counted
+        As in `exceeding`.
+    """
+    v, out = variances(made, modes, state, static), np.full(made.fixed.size, -inf)
+    counted = counted & (made.allowed < inf) & (v < KNOWN * made.fixed)
     if not any_of(counted):
-        return -inf
-    m, v = means(made, modes, state, static), variances(made, modes, state, static)
-    m, v, phi, a = m[counted], v[counted], made.fixed[counted], made.allowed[counted]
-    # At least rounding: a meter that no reading informs about has none.
-    G = np.maximum(1.0 / v - 1.0 / phi, np.finfo(np.float64).eps / phi)
-    g, wider = m / v, 1.0 + SIZE**2 * G
+        return out
+    m = means(made, modes, state, static)[counted]
+    v, phi, a = v[counted], made.fixed[counted], made.allowed[counted]
+    G, g = 1.0 / v - 1.0 / phi, m / v
+    wider = 1.0 + SIZE**2 * G
     beyond = np.maximum(np.abs(g) - a * G, 0.0)
-    each = 0.5 * ((beyond * beyond - g * g / wider) / G - np.log(wider))
-    top = float(each.max())
-    return top + log(float(np.exp(each - top).sum()) / made.fixed.size)
+    out[counted] = 0.5 * ((beyond * beyond - g * g / wider) / G - np.log(wider))
+    return out

@@ -1,4 +1,4 @@
-"""Statistical core of one feeder, in shadow operation beside the default monitor.
+"""Statistical core of one feeder: filter, test, search and estimate on the residuals of a front end.
 
     design(front) -> Core
     init(core, t) -> CoreState
@@ -76,7 +76,7 @@ LIKELY = 0.01
 CALM = 0.5
 """Part of the limit of log M below which suspected onsets are given up, 1."""
 EARLY = 64
-"""Ticks at the start, and from one comparison with the classes to the next: learning is slow."""
+"""Ticks that are all compared with the classes, and later those from one comparison to the next."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,8 +139,8 @@ class CoreState:
         Masked meters.
     rivals
         The model and its rivals since the start of the kept readings, with the likeliest pinned onset.
-    beyond
-        Log evidence against the accuracy classes when it was evaluated last; None before.
+    beyond : (p,)
+        Meters with an own error beyond their accuracy class when they were compared last.
     """
 
     filter: FilterState
@@ -151,7 +151,12 @@ class CoreState:
     suspected: tuple[Suspected, ...]
     masked: Masked
     rivals: tuple[Rival, ...] = ()
-    beyond: float | None = None
+    beyond: Bools | None = None
+
+    @property
+    def exceeding(self) -> Bools:
+        """Meters in use with an own error beyond their accuracy class, (p,)."""
+        return np.zeros_like(self.masked.meters) if self.beyond is None else self.beyond & ~self.masked.meters
 
 
 def assemble(
@@ -309,11 +314,8 @@ def step(  # noqa: PLR0917  # the state, and one tick
     if any_of(masked.meters) and after.full is not None:
         masked = masking.follow(made, masked, after.full, m, read)
     beyond = state.beyond
-    if evidence.log_m > -inf:
-        if beyond is None or pinned or test.ticks <= EARLY or test.ticks % EARLY == 0:
-            beyond = classes.evidence(core.classes, made, after, known, ~masked.meters)
-        evidence = evidence.joined(test.onsets.oldest, beyond)
-        test = replace(test, log_m=evidence.log_m)
+    if test.ticks <= EARLY or test.ticks % EARLY == 0:
+        beyond = classes.exceeding(core.classes, made, after, known, ~masked.meters, core.limit)
     suspected = state.suspected
     if update.exact is not None:
         if pinned and not suspected:
@@ -359,13 +361,13 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
     def masked(k: int, seen: Bools | None, unknown: Floats | None) -> tuple[Bools | None, Floats | None]:
         return seen if k < first else ~named if seen is None else seen & ~named, unknown
 
-    now, evidence = again(core, history, first, masked, begun)
+    now, evidence = again(core, state, first, masked, begun)
     return replace(now, masked=masking.added(state.masked, named)), evidence
 
 
 def again(
     core: Core,
-    history: History,
+    state: CoreState,
     first: int,
     change: Callable[[int, Bools | None, Floats | None], tuple[Bools | None, Floats | None]],
     begun: FilterState | None = None,
@@ -374,8 +376,8 @@ def again(
 
     Parameters
     ----------
-    core, history
-        The core, and the readings.
+    core, state
+        The core, and the state with the readings.
     first
         Number of the first reading that changes; negative: before all that are kept. The detector then starts
         anew.
@@ -384,12 +386,13 @@ def again(
     begun
         Filter before the first kept reading; None: as it was.
     """
+    history = state.history
     kept, (before, known, test, _) = history.until(max(0, first))
     if first < 0:
         before, test = begun or before, detector.start(core.modes)
         kept = History((before, known, test, ()))
     test = detector.pin(test, np.zeros(0, np.intp))
-    now = CoreState(before, known, test, None, kept, (), masking.none(core.modes))
+    now = CoreState(before, known, test, None, kept, (), masking.none(core.modes), beyond=state.beyond)
     evidence = Evidence(-inf, np.full(test.capital.shape, -inf))
     for k in range(len(kept.readings), len(history.readings)):
         t, m, seen, unknown = history.readings[k]
@@ -421,11 +424,7 @@ def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
         joint = rival.joint()
         after = replace(after, full=replay.freed(rival.modes, whole, joint, W, std, loads=True))
     parts = after, rival.static, detector.start(core.modes)
-    beyond = classes.evidence(core.classes, core.modes, after, rival.static, ~state.masked.meters)
-    if beyond >= core.limit:
-        # No model of the loads explains an error beyond the class of a meter.
-        return state
-    return CoreState(*parts, rival.update, History((*parts, ())), (), state.masked, beyond=beyond)
+    return CoreState(*parts, rival.update, History((*parts, ())), (), state.masked, beyond=state.beyond)
 
 
 def doubted(found: Identification, meters: int) -> float:

@@ -170,18 +170,6 @@ class Evidence:
         """Rows of the onsets with the largest parts in M, the largest first, (`PINS`,)."""
         return np.asarray(np.argsort(-self.by_row.max(axis=0), kind="stable")[:PINS])
 
-    def joined(self, row: int, more: float) -> Evidence:
-        """The same with evidence against members since one onset, its logarithm with all weights.
-
-        Parameters
-        ----------
-        row, more
-            Row of the onset, and the logarithm.
-        """
-        by_row = self.by_row.copy()
-        by_row[0, row] = np.logaddexp(by_row[0, row], more)
-        return Evidence(float(np.logaddexp(self.log_m, more)), by_row)
-
 
 def start(modes: Modes) -> Detector:
     """Detector before the first tick.

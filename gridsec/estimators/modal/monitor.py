@@ -97,7 +97,7 @@ SETTLING = 32
 JUMP = 6.0
 """Standard deviations of an innovation beyond which a reading does not drive an inverter, 1."""
 HELD = 8
-"""Ticks without a jump after which a reading that jumped is believed: log M is evaluated twice in them."""
+"""Readings from a jump on for which the verdict is open: log M is evaluated twice in them."""
 PAUSE = 60.0
 """Ticks without a frame that count as a pause for the time of commissioning."""
 
@@ -261,7 +261,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     jumps = trusted & ~given.trust.trusted
     held = state.held
     if any_of(jumps) or any_of(held):
-        held = np.where(jumps, HELD, np.maximum(held - 1, 0))
+        held = np.where(jumps, HELD, np.maximum(held - measured.available, 0))
     v2 = predicted.v2_bus[front.prior.meters]
     skew = given.clock_skew
     if skew is not None or frame.clock_offset is not None:
@@ -462,7 +462,7 @@ def _without_busbar(
         more = columns if unknown is None else np.hstack([unknown, columns])
         return seen, unknown if k < first else more
 
-    now, evidence = core.again(design.core, kernel.history, first, unmetered)
+    now, evidence = core.again(design.core, kernel, first, unmetered)
     after = replace(
         state,
         front=changed(state.front, busbar=_suspected_busbar(front, state.front.busbar, named)),
@@ -512,6 +512,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         named=named,
         unread=np.zeros_like(seen) if tick.unknown is None else tick.unknown.unchecked,
         jumps=tick.held > 0,
+        beyond=kernel.exceeding,
         evidence=evidence,
         suspected=suspected,
         explanations=rivals,
@@ -538,11 +539,12 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         busbar=given.busbar,
         busbar_attack=given.busbar_off,
     )
-    calm = not (suspected or any_of(named) or any_of(~busbar.trusted))
+    doubtful = _doubtful(kernel)
+    calm = not (doubtful or any_of(named) or any_of(~busbar.trusted))
     kept = (
         record.kept(design.core.modes, state.kept, kernel.filter, kernel.static, now.ticks) if calm else None
     )
-    learning = _gathered(design, trust, tick, suspected=suspected)
+    learning = _gathered(design, trust, tick, suspected=doubtful)
     after = changed(
         trust,
         t=tick.measured.frame.t,
@@ -560,6 +562,11 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
     )
     out = changed(state, front=after, kept=kept or state.kept, held=tick.held)
     return (out if learning is None else _learned(design, out)), estimate, answer
+
+
+def _doubtful(kernel: CoreState) -> bool:
+    """The readings disagree, or a meter exceeds its class: nothing is learned, and no reading is a bound."""
+    return any_of(kernel.detector.pinned) or any_of(kernel.exceeding)
 
 
 def _trust(
@@ -637,7 +644,7 @@ def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Esti
         else np.where(measured.busbar_metered, measured.v0_squared, v2_bus[first])
     )
     # While the readings disagree and no search has settled it, no reading bounds a voltage.
-    sure = now.trust.trusted & measured.available & (not any_of(state.core.detector.pinned))
+    sure = now.trust.trusted & measured.available & (not _doubtful(state.core))
     powers = tick.predicted.powers
     inputs = BoundInputs(
         plant=plant,
@@ -755,7 +762,7 @@ def _learned(design: ModalDesign, state: ModalState) -> ModalState:
     """State with the errors of meters that have been read for the time of commissioning."""
     front, now = design.front, state.front
     gathered = now.learning
-    if gathered is None or any_of(state.core.detector.pinned):
+    if gathered is None or _doubtful(state.core):
         return state
     done = ready_meters(front, gathered) & gathered.open & now.trust.trusted & (gathered.count > 0)
     if not any_of(done):
@@ -829,8 +836,8 @@ def renew(design: ModalDesign, state: ModalState, which: Bools) -> ModalState:
         attack_kinds=replace(kinds, history=forget_readings(kinds.history, which)),
         trust=state.front.trust.replaced(which),
     )
-    zero = 0 * state.streak, 0 * state.phases, 0 * state.inverters
-    return ModalState(now, begun, None, *zero, 0, record.made(modes, opened, kernel.static), zero[0])
+    zero, held = (0 * state.streak, 0 * state.phases, 0 * state.inverters), np.where(which, 0, state.held)
+    return ModalState(now, begun, None, *zero, 0, record.made(modes, opened, kernel.static), held)
 
 
 def progress(design: ModalDesign, commission: Commission) -> LearningProgress:

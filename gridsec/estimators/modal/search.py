@@ -40,6 +40,7 @@ from gridsec.estimators.modal.costs import (
     amounts,
     costs,
     informed,
+    mean_amounts,
     mean_likelihood,
 )
 from gridsec.estimators.modal.laterals import GAIN, Groups, excess, filled, in_common, similar, together
@@ -218,19 +219,18 @@ def search(
         + cost
         for end, sets, cost in zip(ends, one_amount, more, strict=True)
     ]
-    found = []
+    found, problems = [], list[SearchProblem]()
     for end, sets, best, cost in zip(ends, one_amount, least, more, strict=True):
         if best < min(least) + HOPELESS:
             met = _explored(end, sets, groups, batches)
         else:
             met = {end.chosen.tobytes(): end.cost}
             _with_amounts_alike(end.problem, met, sets[:1])
-        if known is not None:
-            _recalled(end.problem, met, known)
+        problems.append(end.problem if known is None else _recalled(end.problem, met, known))
         keys = list(met)
         less = excess(np.stack([np.frombuffer(key, dtype=np.bool_) for key in keys]), whole, read)
         found.append({key: met[key] + cost - float(one) for key, one in zip(keys, less, strict=True)})
-    return identified(tuple(end.problem for end in ends), tuple(found))
+    return identified(tuple(problems), tuple(found))
 
 
 def _descended(problem: SearchProblem, starts: tuple[Bools, ...], groups: Groups) -> Tableau:
@@ -302,17 +302,25 @@ def _with_amounts_alike(problem: SearchProblem, found: dict[bytes, float], more:
             found[keys[k]] = cost
 
 
-def _recalled(problem: SearchProblem, found: dict[bytes, float], known: Bools) -> None:
-    """Add sets of an earlier search, (k, q), each with the prior size that suits it, if that is cheaper.
+def _recalled(problem: SearchProblem, found: dict[bytes, float], known: Bools) -> SearchProblem:
+    """Add sets of an earlier search, (k, q); the problem, with the size of one of them if it is best of all.
 
-    The size of the problem is that of the best set. It speaks against sets of far larger or smaller amounts.
+    The size of the problem is that of its best set. It speaks against sets of far larger or smaller amounts.
+    So these sets have the mean of both likelihoods, with it and with the size that suits them. Sets with
+    impossible amounts do not count.
     """
-    for chosen in known:
+    out, least = problem, min(found.values())
+    for chosen in np.unique(known, axis=0):
         own, one = _sized(problem, chosen), chosen[None]
+        if chosen.any() and (np.abs(mean_amounts(own, chosen)) > own.bound[chosen]).any():
+            continue
         alike = ALIKE if np.count_nonzero(chosen[: problem.meters]) > 1 else 0.0
-        each = np.stack([[costs(size, one, share) for share in (0.0, alike)] for size in (problem, own)])
-        least = float(mean_likelihood(each.transpose(1, 0, 2)).min())
-        found[chosen.tobytes()] = min(least, found.get(chosen.tobytes(), inf))
+        each = np.stack([costs(size, one, share) for size in (problem, own) for share in (0.0, alike)])
+        cost = float(mean_likelihood(each)[0])
+        found[chosen.tobytes()] = min(cost, found.get(chosen.tobytes(), inf))
+        if cost < least:
+            out, least = own, cost
+    return out
 
 
 def _best(starts: tuple[Tableau, ...], groups: Groups) -> Tableau:

@@ -357,8 +357,9 @@ class Inputs:
         The frame.
     seen, named, unread : (p,)
         Meters with a reading, named ones, and those with a reading that no known power checks.
-    jumps : (p,)
-        Readings that jump, and therefore drive no inverter, or did so a few ticks ago.
+    jumps, beyond : (p,)
+        Readings that jump, and therefore drive no inverter, or did so a few ticks ago. Meters with an own
+        error beyond their accuracy class.
     evidence
         Evidence of the meters.
     suspected
@@ -380,6 +381,7 @@ class Inputs:
     named: Bools
     unread: Bools
     jumps: Bools
+    beyond: Bools
     evidence: MeterEvidence
     suspected: bool
     explanations: tuple[Explanation, ...]
@@ -422,7 +424,7 @@ def verdict(design: SequentialDesign, now: Inputs, estimate: Estimate) -> Findin
     finding = _busbar(design, now, estimate, finding)
     if now.suspected:
         finding = _suspected(design, now, finding)
-    finding = _jumping(design, now, finding)
+    finding = _doubted(design, now, finding)
     finding = _inverters(design, now, finding)
     return _clock(design, now, tested, _unread_powers(design, now, estimate, finding))
 
@@ -510,13 +512,21 @@ def _suspected(design: SequentialDesign, now: Inputs, finding: Finding) -> Findi
     return Decision.UNDECIDED, Cause.AMBIGUOUS, explanations_sentence(design, some)
 
 
-def _jumping(design: SequentialDesign, now: Inputs, finding: Finding) -> Finding:
-    """UNDECIDED where inverters do without readings that jump: their injections may hide a manipulation."""
-    if finding[1] not in (Cause.AGREEMENT, Cause.SILENT_METERS) or not any_of(now.jumps):
+def _doubted(design: SequentialDesign, now: Inputs, finding: Finding) -> Finding:
+    """UNDECIDED where meters exceed their class, and where readings that jump drive no inverter.
+
+    The unknown injections of such inverters may hide a manipulation.
+    """
+    if finding[1] not in (Cause.AGREEMENT, Cause.SILENT_METERS):
         return finding
-    meters = ", ".join(design.names[j] for j in np.flatnonzero(now.jumps))
-    sentence = f"Readings jump and drive no inverter until they agree with the feeder again: {meters}."
-    return Decision.UNDECIDED, Cause.MISFIT, sentence
+    for which, sentence in (
+        (now.beyond, "Constant errors exceed the accuracy class, or the feeder is not as in its files"),
+        (now.jumps, "Readings jump and drive no inverter until they agree with the feeder again"),
+    ):
+        if any_of(which):
+            meters = ", ".join(design.names[j] for j in np.flatnonzero(which))
+            return Decision.UNDECIDED, Cause.MISFIT, f"{sentence}: {meters}."
+    return finding
 
 
 def _accuses(explanation: Explanation) -> bool:

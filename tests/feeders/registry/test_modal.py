@@ -266,6 +266,25 @@ def test_a_reading_that_jumps_and_drives_no_inverter_leaves_the_verdict_open() -
     assert decisions[last].decision is Decision.CLEAN
 
 
+def test_a_lie_beyond_the_class_from_the_first_reading_on_is_undecided() -> None:
+    """Class 0.5 %, off by 1.2 %: 4.2 deviations of the prior. Nothing is learned; a new meter is CLEAN."""
+    frames, _ = played(0.0)
+    made, state, j = watcher().design, watcher().init(frames[0].t), 4
+    assert isinstance(made, monitor.ModalDesign)
+    factor = np.where(np.arange(frames[0].y.size) == j, 1.012**2, 1.0)
+    for frame in frames:
+        state, _, answer = watcher().step(state, replace(frame, y=frame.y * factor))
+    assert (answer.decision, answer.cause) == (Decision.UNDECIDED, Cause.MISFIT)
+    assert answer.reason.endswith(f"files: {made.front.names[j]}.")
+    assert not answer.suspects.any()
+    assert np.flatnonzero(state.core.exceeding).tolist() == [j]
+    assert state.kept is None
+    state = monitor.renew(made, state, np.arange(factor.size) == j)
+    for frame in frames:
+        state, _, answer = watcher().step(state, replace(frame, t=frame.t + TICKS))
+    assert answer.decision is Decision.CLEAN
+
+
 def test_a_replaced_meter_is_trusted_again_with_an_unknown_error() -> None:
     """Posterior of `renew` against dense conditioning of own errors; nothing else is forgotten."""
     made, (state, _, _) = watcher().design, attacked()

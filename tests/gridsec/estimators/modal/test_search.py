@@ -110,19 +110,33 @@ def test_amounts_that_become_impossible_are_removed() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_set_of_an_earlier_search_counts_with_the_size_that_suits_it(seed: int) -> None:
-    """Sets with one meter and with three that no descent meets, beside a problem with a far smaller size."""
+    """Sets of one meter and of three, beside a problem with a far smaller size; the truth is kept."""
     given = replace(problem(seed, liars=3), std=np.concatenate([np.full(8, 0.05), np.ones(2)]))
-    known = np.array([[0, 0, 0, 1, 0, 0, 0, 0, 0, 0], [1, 0, 1, 0, 1, 0, 0, 0, 0, 1]], dtype=np.bool_)
-    found: dict[bytes, float] = {known[0].tobytes(): 1e6}
-    s._recalled(given, found, known)
-    for chosen in known:
+    truth = s.search(problem(seed, liars=3)).chosen[0]
+    known = np.array([[0, 0, 0, 1, 0, 0, 0, 0, 0, 0], truth, truth], dtype=np.bool_)
+    found: dict[bytes, float] = {np.zeros(10, dtype=np.bool_).tobytes(): 1e6}
+    out = s._recalled(given, found, known)
+    for chosen in known[:2]:
         mean, cov = amounts(given, chosen)
         count = int(chosen[:8].sum())
         size = float(np.sqrt(np.mean((mean**2 + np.diag(cov))[:count])))
         suited = replace(given, std=np.concatenate([np.full(8, size), np.ones(2)]))
-        assert found[chosen.tobytes()] == pytest.approx(min(total(given, chosen), total(suited, chosen)))
-        assert total(suited, chosen) < total(given, chosen)
+        both = [total(given, chosen), total(suited, chosen)]
+        expected = 2.0 * (np.log(2.0) - np.logaddexp(*(-0.5 * np.array(both))))
+        assert found[chosen.tobytes()] == pytest.approx(expected)
+        if found[chosen.tobytes()] == min(found.values()):
+            assert out.std[0] == pytest.approx(size)
+    assert min(found.values()) < 1e6
     kept = s.search(given, known=known)
-    every = {each.tobytes() for each in kept.chosen}
-    likely = min(found.values()) < -2.0 * np.log(s.BELIEVED) + total(kept.problems[0], kept.chosen[0])
-    assert not likely or min(found, key=lambda key: found[key]) in every
+    assert truth.tobytes() in {each.tobytes() for each in kept.chosen}
+
+
+def test_sets_with_impossible_amounts_are_not_recalled() -> None:
+    """The bound of a power is a tenth of what the readings say."""
+    given, chosen = problem(1), np.isin(np.arange(10), [9])
+    amount = float(amounts(given, chosen)[0][0])
+    bound = np.where(np.arange(10) == 9, 0.1 * abs(amount), np.inf)
+    for each, count in ((given, 2), (replace(given, bound=bound), 1)):
+        found = {np.zeros(10, dtype=np.bool_).tobytes(): 1e6}
+        s._recalled(each, found, chosen[None])
+        assert len(found) == count
