@@ -48,7 +48,7 @@ from gridsec.estimators.modal.mirrors import Neighbourhoods
 from gridsec.estimators.modal.model import Modes, ResidualModel, modes, residual_model
 from gridsec.estimators.modal.replay import History, Parts, Suspected
 from gridsec.estimators.modal.rivals import Rival
-from gridsec.estimators.modal.search import Identification, search
+from gridsec.estimators.modal.search import DOUBT, Identification, search
 from gridsec.estimators.modal.signatures import Columns, Joint
 from gridsec.estimators.modal.static import Static
 from gridsec.estimators.sequential.design import YEAR_S, SequentialDesign
@@ -71,8 +71,8 @@ LASTS = 0.2
 """Standard deviation of a lasting error along an unknown direction, in that of one tick of the filter, 1."""
 ADOPTED = 0.05
 """Largest weight of sets that need a meter where loads are adopted, 1: a meter may hide its own load."""
-LIKELY = 0.01
-"""Least weight of an explanation that the next search knows, 1: that of reported explanations."""
+RECALLED = 24
+"""Largest number of explanations that the next search knows, 1."""
 CALM = 0.5
 """Part of the limit of log M below which suspected onsets are given up, 1."""
 EARLY = 64
@@ -501,7 +501,7 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     """
     test, known = state.detector, None
     if before is not None:
-        known = before.found.chosen[before.found.weight >= LIKELY]
+        known = _keeping(before.found)
     rows = [] if state.suspected else [int(evidence.rows[0])]
     rows = list(dict.fromkeys(rows + np.flatnonzero(test.pinned & test.onsets.used).tolist()))
     rows = sorted(rows, key=lambda row: _misfit(core, _joint(core, _parts(state), row)))
@@ -515,6 +515,13 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
         found = _searched(core, state, rows[best], known)
     found = collusion.weighed(mirrors.reflected(found, core.near), state.masked.meters, core.near)
     return Suspicion(rows[best], found)
+
+
+def _keeping(found: Identification) -> Bools:
+    """The likeliest sets, (k, q), that keep meters of the best one from names, and the best one."""
+    p, best = found.named.size, found.chosen[0]
+    lacks = (best[:p] & ~found.chosen[:, :p]).any(axis=1)
+    return np.vstack([best[None], found.chosen[lacks & (found.weight >= DOUBT)][:RECALLED]])
 
 
 def _unknown(state: CoreState) -> Floats | None:

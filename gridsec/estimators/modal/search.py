@@ -63,6 +63,8 @@ STEPS = 4
 """Largest number of steps of a descent, in meters: each may be added, removed and exchanged."""
 RELEVANCE = 12
 """Iterations of the start by relevance: variances of irrelevant meters halve in each."""
+SUITED = 0.1
+"""Weight of the size that suits a set of an earlier search, 1: it is chosen by the readings."""
 STANDS_OUT = 9.0
 """Squared standard deviations from which a meter is in that start, 1."""
 
@@ -306,8 +308,8 @@ def _recalled(problem: SearchProblem, found: dict[bytes, float], known: Bools) -
     """Add sets of an earlier search, (k, q); the problem, with the size of one of them if it is best of all.
 
     The size of the problem is that of its best set. It speaks against sets of far larger or smaller amounts.
-    So these sets have the mean of both likelihoods, with it and with the size that suits them. Sets with
-    impossible amounts do not count.
+    So these sets have the mean of both likelihoods, with it and, at the weight `SUITED`, with the size that
+    suits them. Sets with impossible amounts do not count.
     """
     out, least = problem, min(found.values())
     for chosen in np.unique(known, axis=0):
@@ -315,8 +317,9 @@ def _recalled(problem: SearchProblem, found: dict[bytes, float], known: Bools) -
         if chosen.any() and (np.abs(mean_amounts(own, chosen)) > own.bound[chosen]).any():
             continue
         alike = ALIKE if np.count_nonzero(chosen[: problem.meters]) > 1 else 0.0
-        each = np.stack([costs(size, one, share) for size in (problem, own) for share in (0.0, alike)])
-        cost = float(mean_likelihood(each)[0])
+        each = np.array([[costs(size, one, share)[0] for size in (problem, own)] for share in (0.0, alike)])
+        shared, suited = mean_likelihood(each)
+        cost = -2.0 * float(np.logaddexp(log(1.0 - SUITED) - 0.5 * shared, log(SUITED) - 0.5 * suited))
         found[chosen.tobytes()] = min(cost, found.get(chosen.tobytes(), inf))
         if cost < least:
             out, least = own, cost

@@ -152,7 +152,6 @@ def test_a_lie_from_the_first_reading_on_exceeds_the_class(share: float) -> None
         seen = random.random(METERS) >= share
         state, _ = core.step(kernel, state, float(k), source.tick() + lie(3.0), seen)
         found.append(np.flatnonzero(state.exceeding).tolist())
-    assert not found[2]
     assert found[60:] == 140 * [[LIAR]]
     assert not state.detector.pinned.any()
 

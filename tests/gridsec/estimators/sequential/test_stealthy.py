@@ -59,8 +59,9 @@ def test_an_optimised_third_is_clean_up_to_twice_the_unavoidable_minimum(feeder:
     plays = [scene.play(adversary.step, *one) for one in scene.attacks(adversary.step)]
     assert [one.share for one in plays] == list(adversary.SHARES)
     # The first seconds after a restart are UNDECIDED.
-    assert plays[0].clean >= (90.0 if attack == "restart" else 100.0)
-    assert plays[0].ratio > 0.5
+    within = next(one for one in plays if one.share == 0.6)
+    assert within.clean >= (90.0 if attack == "restart" else 100.0)
+    assert within.ratio > 0.5
     assert plays[-1].clean <= 5.0
     assert max(one.ratio for one in plays) <= 2.2
     assert all(one.honest == 0 for one in plays)
