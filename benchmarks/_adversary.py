@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import log
 from typing import Any
 
@@ -65,9 +65,12 @@ class World:
     @property
     def monitor(self) -> DesignedEstimator:
         """The default monitor, without commissioning of its own."""
-        if self.aged:
-            return _designed(self, SEQUENTIAL)
-        return watcher(self.setting.feeder, Model.MATCHED)
+        return self.estimator(SEQUENTIAL)
+
+    def estimator(self, name: str, step_s: float = 1.0, commission_s: float = 0.0) -> DesignedEstimator:
+        """An estimator for the feeder as its files state it."""
+        of = _aged_watcher if self.aged else partial(watcher, model=Model.MATCHED)
+        return of(self.setting.feeder, step_s=step_s, commission_s=commission_s, estimator=name)
 
     def frames(self, duration_s: float) -> Iterator[tuple[Frame, Floats]]:
         """Honest frames and true squared voltages, (N,), from `START` on."""
@@ -87,6 +90,14 @@ def _aged(feeder: str) -> Site:
     tables = site(feeder).tables
     meters = replace(tables.meta.meters, p_interval_s=LATE_S)
     return from_tables(replace(tables, meta=replace(tables.meta, meters=meters)))
+
+
+@lru_cache(maxsize=8)
+def _aged_watcher(feeder: str, *, step_s: float, commission_s: float, estimator: str) -> DesignedEstimator:
+    """As `watcher`, where powers are late."""
+    tables = _aged(feeder).tables
+    settings = replace(tables.meta.monitor, estimator=estimator, commission_s=commission_s, tick_s=step_s)
+    return design(from_tables(replace(tables, meta=replace(tables.meta, monitor=settings))))
 
 
 def _with_late_powers(where: Site, frame: Frame, old: Frame) -> Frame:
@@ -124,14 +135,14 @@ class Registered:
 
     def __init__(self, name: str, world: World) -> None:
         self.name, self.world = name, world
-        self.design = world.monitor if name == SEQUENTIAL else _designed(world, name)
+        self.design = world.estimator(name)
 
     def start(self, learning: Iterable[Frame]) -> Any:
         """State before the first frame, with the errors learned by the frames of the learning run, if any."""
         frames, by = list(learning), self.design.family.bias_learning
         if not frames or by is None:
             return self.design.init(START)
-        made = _designed(self.world, self.name, LEARN_STEP_S, LEARN_S)
+        made = self.world.estimator(self.name, LEARN_STEP_S, LEARN_S)
         state = made.init(START - LEARN_S - 2.0 * LEARN_STEP_S)
         for frame in frames:
             state, _, _ = made.step(state, frame)
@@ -141,13 +152,6 @@ class Registered:
         """Process one frame."""
         state, estimate_, verdict = self.design.step(state, frame)
         return state, Answer(estimate_.v2, verdict.decision, verdict.suspects)
-
-
-def _designed(world: World, name: str, tick_s: float = 1.0, commission_s: float = 0.0) -> DesignedEstimator:
-    """Estimator for the world as its files state it."""
-    tables = world.site.tables
-    settings = replace(tables.meta.monitor, estimator=name, commission_s=commission_s, tick_s=tick_s)
-    return design(from_tables(replace(tables, meta=replace(tables.meta, monitor=settings))))
 
 
 def learning(setting: Setting) -> Iterator[Frame]:

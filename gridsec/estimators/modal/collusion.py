@@ -47,15 +47,13 @@ from gridsec.arrays import Bools, Floats, Ints, any_of, submatrix
 from gridsec.estimators.modal.costs import (
     SearchProblem,
     Tableau,
-    costs,
     informed,
     mean_amounts,
-    mean_likelihood,
     penalties,
 )
 from gridsec.estimators.modal.laterals import GAIN, OneAmount
 from gridsec.estimators.modal.mirrors import Neighbourhoods
-from gridsec.estimators.modal.search import ALIKE, DOUBT, Identification, costs_of, identified
+from gridsec.estimators.modal.search import DOUBT, Identification, costs_of, identified, mixed
 
 MISFIT = 0.1
 """Share of an explanation's evidence that steps and ramps leave open, 1."""
@@ -169,11 +167,7 @@ def _without(chosen: Bools, meters: Bools) -> Bools:
 def _evidence(problem: SearchProblem, sets: Bools) -> Floats:
     """L of sets, (k,), with amounts of their own and with amounts alike, the mean of both likelihoods."""
     count = np.count_nonzero(sets[:, : problem.meters], axis=1)
-    out = costs(problem, sets)
-    several = np.flatnonzero(count > 1)
-    if several.size:
-        out[several] = mean_likelihood(np.stack([out[several], costs(problem, sets[several], ALIKE)]))
-    return np.asarray(out - penalties(problem.meters)[count])
+    return np.asarray(mixed(problem, sets) - penalties(problem.meters)[count])
 
 
 def _beside(problem: SearchProblem, own: Bools, meters: Bools) -> tuple[Ints, Floats, Floats]:

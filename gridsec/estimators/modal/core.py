@@ -499,9 +499,7 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     before
         What an earlier search found: its likely sets count in this one, too. None: none.
     """
-    test, known = state.detector, None
-    if before is not None:
-        known = _keeping(before.found)
+    test, known = state.detector, None if before is None else _keeping(before.found)
     rows = [] if state.suspected else [int(evidence.rows[0])]
     rows = list(dict.fromkeys(rows + np.flatnonzero(test.pinned & test.onsets.used).tolist()))
     rows = sorted(rows, key=lambda row: _misfit(core, _joint(core, _parts(state), row)))
@@ -521,7 +519,10 @@ def _keeping(found: Identification) -> Bools:
     """The likeliest sets, (k, q), that keep meters of the best one from names, and the best one."""
     p, best = found.named.size, found.chosen[0]
     lacks = (best[:p] & ~found.chosen[:, :p]).any(axis=1)
-    return np.vstack([best[None], found.chosen[lacks & (found.weight >= DOUBT)][:RECALLED]])
+    # One set may be likely under several models.
+    return np.unique(
+        np.vstack([best[None], found.chosen[lacks & (found.weight >= DOUBT)][:RECALLED]]), axis=0
+    )
 
 
 def _unknown(state: CoreState) -> Floats | None:

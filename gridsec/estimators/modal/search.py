@@ -296,12 +296,28 @@ def _with_amounts_alike(problem: SearchProblem, found: dict[bytes, float], more:
     keys = sorted(found, key=lambda key: found[key])[:SOME]
     keys = list(dict.fromkeys([*keys, *(each.tobytes() for each in more)]))
     sets = np.stack([np.frombuffer(key, dtype=np.bool_) for key in keys])
+    found.update(
+        zip(keys, mixed(problem, sets, np.array([found[key] for key in keys])).tolist(), strict=True)
+    )
+
+
+def mixed(problem: SearchProblem, sets: Bools, own: Floats | None = None) -> Floats:
+    """Costs of sets with both priors of the amounts mixed, (k,): independent amounts and amounts alike.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    sets : (k, q)
+        The sets; those of one meter have one prior.
+    own : (k,)
+        Their costs with independent amounts; None: computed here.
+    """
+    out = costs(problem, sets) if own is None else own.copy()
     several = np.flatnonzero(np.count_nonzero(sets[:, : problem.meters], axis=1) > 1)
     if several.size:
-        own = np.array([found[keys[k]] for k in several])
-        both = mean_likelihood(np.stack([own, costs(problem, sets[several], ALIKE)]))
-        for k, cost in zip(several, both.tolist(), strict=True):
-            found[keys[k]] = cost
+        out[several] = mean_likelihood(np.stack([out[several], costs(problem, sets[several], ALIKE)]))
+    return out
 
 
 def _recalled(problem: SearchProblem, found: dict[bytes, float], known: Bools) -> SearchProblem:
@@ -312,13 +328,11 @@ def _recalled(problem: SearchProblem, found: dict[bytes, float], known: Bools) -
     suits them. Sets with impossible amounts do not count.
     """
     out, least = problem, min(found.values())
-    for chosen in np.unique(known, axis=0):
-        own, one = _sized(problem, chosen), chosen[None]
+    for chosen, shared in zip(known, mixed(problem, known), strict=True):
+        own = _sized(problem, chosen)
         if chosen.any() and (np.abs(mean_amounts(own, chosen)) > own.bound[chosen]).any():
             continue
-        alike = ALIKE if np.count_nonzero(chosen[: problem.meters]) > 1 else 0.0
-        each = np.array([[costs(size, one, share)[0] for size in (problem, own)] for share in (0.0, alike)])
-        shared, suited = mean_likelihood(each)
+        suited = mixed(own, chosen[None])[0]
         cost = -2.0 * float(np.logaddexp(log(1.0 - SUITED) - 0.5 * shared, log(SUITED) - 0.5 * suited))
         found[chosen.tobytes()] = min(cost, found.get(chosen.tobytes(), inf))
         if cost < least:

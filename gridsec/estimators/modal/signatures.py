@@ -91,11 +91,6 @@ class Onsets:
     lost: Floats | None = field(default=None, repr=False)
     busbar: Floats | None = field(default=None, repr=False)
 
-    @property
-    def oldest(self) -> int:
-        """Row of the oldest step."""
-        return int(np.where(self.used & ~self.ramp, self.age, -1).argmax())
-
 
 def empty(modes: Modes, steps: int, ramps: int = 0) -> Onsets:
     """Rows without onsets.

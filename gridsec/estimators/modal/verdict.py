@@ -223,7 +223,7 @@ def _row(state: CoreState, evidence: Evidence, suspicion: Suspicion | None) -> i
         of_meters = np.where(onsets.used, evidence.by_row[0], -inf)
         if of_meters.max() > -inf:
             return int(of_meters.argmax())
-    return onsets.oldest
+    return int(np.where(onsets.used & ~onsets.ramp, onsets.age, -1).argmax())
 
 
 # --- Explanations ---
