@@ -17,6 +17,11 @@ explanation of more meters names none.
 with the most of C, but not all, splits it. Both parts are checked by themselves, and split again up to
 `SPLITS` times: honest meters that seem off together are neighbours.
 
+**False powers.** A coalition of customers that also report false powers can imitate a false power elsewhere
+beside an honest meter. Where J has faults that are no meters, customers with a false reading and a false
+power each, without a charge, are looked for in place of C and of these faults: the customer that lowers L
+most is added until none lowers it.
+
 **Search of g.** Given the amounts of the rest J - C, g has the information F and the scores y. One amount x
 has the relaxation
 
@@ -37,6 +42,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from math import inf, log
 from typing import Self
 
@@ -100,7 +106,8 @@ def weighed(found: Identification, masked: Bools, near: Neighbourhoods) -> Ident
         if not any_of(accused & named):
             continue
         own, without = _own(problem, J, accused, sign)
-        each, other = min(_instead(problem, J, amount, accused, masked, most), key=lambda pair: pair[0])
+        sets = _instead(problem, J, amount, accused, masked, most)
+        each, other = min(chain(sets, _customers(problem, J, accused, masked, near)), key=lambda one: one[0])
         more = max(0.0, each - own)
         if more < max(least, MISFIT * (without - own)):
             contested |= accused & named
@@ -145,6 +152,31 @@ def _instead(  # noqa: PLR0917  # one explanation
                 yield float(_evidence(problem, each[None])[0]) + cost, both
                 kept.append(both)
     yield from zip(_evidence(problem, np.stack(kept)).tolist(), kept, strict=True)
+
+
+def _customers(
+    problem: SearchProblem, J: Bools, accused: Bools, masked: Bools, near: Neighbourhoods
+) -> Iterator[tuple[float, Bools]]:
+    """L of customers with false readings and powers in place of meters accused, (p,), and the sets (q,)."""
+    p, charge = problem.meters, problem.charge.copy()
+    if not any_of(J[p:]):
+        return
+    charge[near.powers] = 0.0
+    free, chosen = replace(problem, charge=charge), _without(J, accused)
+    chosen[p:] = False
+    least, usable = float(_evidence(free, chosen[None])[0]), informed(problem) & ~accused & ~masked
+    while True:
+        added = np.flatnonzero(usable & ~chosen[near.powers])
+        sets = np.repeat(chosen[None], added.size, axis=0)
+        sets[np.arange(added.size), added] = sets[np.arange(added.size), near.powers[added]] = True
+        sets = sets[np.count_nonzero(sets[:, :p] | masked, axis=1) <= max(near.most, p // 3)]
+        each = _evidence(free, sets) if len(sets) else np.zeros(0)
+        if not each.size or not each.min() < least - GAIN:
+            return
+        chosen, least = sets[int(each.argmin())], float(each.min())
+        if any_of(np.abs(mean_amounts(free, chosen)) > free.bound[chosen]):
+            return
+        yield least, chosen
 
 
 def _split(meters: Bools, laterals: Bools) -> tuple[Bools, ...]:

@@ -40,16 +40,17 @@ def explanation(given: SearchProblem, accused: Bools, *, power: bool = False) ->
     return Identification(chosen[None], np.zeros(1, np.intp), np.ones(1), accused, (given,))
 
 
-def contested(given: Identification, masked: Bools, most: int) -> Bools:
+def contested(given: Identification, masked: Bools, most: int, *, powers: bool = False) -> Bools:
     """Named meters that other explanations replace, (p,)."""
-    return given.named & ~collusion.weighed(given, masked, near(most)).named
+    return given.named & ~collusion.weighed(given, masked, near(most, powers=powers)).named
 
 
-def near(most: int) -> Neighbourhoods:
-    """The two laterals, halves of them, and one phase."""
+def near(most: int, *, powers: bool = False) -> Neighbourhoods:
+    """The two laterals, halves of them, and one phase; the one power, or a power of each meter's customer."""
     laterals = np.repeat(np.eye(4, dtype=np.bool_), 3, axis=1)
     whole = np.repeat(np.eye(2, dtype=np.bool_), 6, axis=1)
-    return Neighbourhoods(np.vstack([laterals, whole]), np.ones((METERS, 1), dtype=np.bool_), most)
+    own = METERS + np.arange(METERS) * powers
+    return Neighbourhoods(np.vstack([laterals, whole]), np.ones((METERS, 1), dtype=np.bool_), most, own)
 
 
 def some(*meters: int) -> Bools:
@@ -200,3 +201,44 @@ def test_meters_without_readings_replace_nothing() -> None:
     seen = np.append(some(0, 6), False)
     silent = replace(given, y=given.y * seen, F=given.F * np.outer(seen, seen))
     assert not contested(explanation(silent, some(0, 6)), NONE, 4).any()
+
+
+def customers(lie: Floats, powers: Floats, charge: float = 5.0) -> SearchProblem:
+    """Scores of false readings (p,) and powers (p,): power 1 moves as meter 4 and power 7 beside meter 1."""
+    V = NOISE * np.eye(METERS) + SHARED * np.kron(np.eye(2), np.ones((6, 6)))
+    effect = np.tril(np.ones((METERS, METERS))) / METERS
+    effect[:, 1] = np.eye(METERS)[4] + effect[:, 7] - np.eye(METERS)[1]
+    W = np.hstack([np.eye(METERS), effect])
+    F, y = W.T @ np.linalg.solve(V, W), W.T @ np.linalg.solve(V, W @ np.append(lie, powers))
+    bound = np.append(np.full(METERS, inf), np.full(METERS, 5.0))
+    return SearchProblem(y, F, np.ones(2 * METERS), METERS, np.repeat([0.0, charge], METERS), bound)
+
+
+def test_customers_with_false_powers_contest_an_honest_meter() -> None:
+    """Meter 1 and its power imitate meter 4 and power 7; no other meters do."""
+    given = customers(2.0 * some(1), 2.0 * some(1))
+    shown = Identification(
+        np.append(some(4), some(7))[None], np.zeros(1, np.intp), np.ones(1), some(4), (given,)
+    )
+    assert (contested(shown, NONE, 4, powers=True) == some(4)).all()
+    out = collusion.weighed(shown, NONE, near(4, powers=True))
+    assert (out.chosen[1] == np.append(some(1), some(1))).all()
+    # A masked meter is not named again, and its customer replaces nothing.
+    assert not contested(shown, some(1), 4, powers=True).any()
+
+
+def test_customers_are_added_while_the_evidence_grows() -> None:
+    """Each set has one customer more, the best of all, within the promise and with possible powers."""
+    given = customers(0.7 * some(0, 9), 3.0 * some(0, 9) + 2.0 * some(3))
+    J, free = np.append(some(4), some(7)), replace(given, charge=np.zeros(2 * METERS))
+    found = list(collusion._customers(given, J, some(4), NONE, near(2, powers=True)))
+    assert [int(each[:METERS].sum()) for _, each in found] == [1, 2]
+    assert all((each[:METERS] == each[METERS:]).all() for _, each in found)
+    every = [np.append(some(k), some(k)) for k in range(METERS) if k != 4]
+    assert np.isclose(found[0][0], collusion._evidence(free, np.stack(every)).min())
+    assert np.isclose(found[1][0], collusion._evidence(free, found[1][1][None])[0])
+    assert found[1][0] < found[0][0]
+    bounded = replace(given, bound=np.append(given.bound[:METERS], np.full(METERS, 0.1)))
+    assert not list(collusion._customers(bounded, J, some(4), NONE, near(2, powers=True)))
+    only = np.append(some(4), NONE)
+    assert not list(collusion._customers(given, only, some(4), NONE, near(2, powers=True)))

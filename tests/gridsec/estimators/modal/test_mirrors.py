@@ -81,7 +81,7 @@ def test_a_mirror_image_costs_as_much_as_its_set_where_readings_agree() -> None:
     given.F[:p, :p] = F
     laterals = np.zeros((1, p), dtype=np.bool_)
     laterals[0, 5:] = True
-    near = mirrors.Neighbourhoods(laterals, np.zeros((p, 1), dtype=np.bool_), p)
+    near = mirrors.Neighbourhoods(laterals, np.zeros((p, 1), dtype=np.bool_), p, p + np.arange(p))
     chosen = np.append(truth, False)
     images = list(mirrors._images(given, chosen, near))
     assert all(more > 0.0 for _, more in images)
