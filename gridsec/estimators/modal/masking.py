@@ -5,8 +5,9 @@ the posterior of its fixed error, so that the reading r of a masked meter is com
 
     r - (w + b)   has the variance   P + d   at one tick, and   P + d / n   as a mean of n ticks
 
-with P the variance of w + b, which changes slowly, and d the white variance. A meter is released after
-`RELEASE` readings in turn within `OUTLIER` standard deviations, if their mean is within `AGREES` of its own.
+with P the variance of w + b, which changes slowly, and d the white variance. A meter is released after n
+readings in turn within `OUTLIER` standard deviations, if their mean is within `AGREES` of its own. n is at
+least `RELEASE`, and ``d <= n P``: more readings would hardly sharpen the comparison. It is at most `MOST`.
 A lie that passes is smaller than that. After the release it is subject to the detector as any other.
 """
 
@@ -20,8 +21,8 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.estimators.modal.filter import Full
 from gridsec.estimators.modal.model import Modes
 
-RELEASE = 60
-"""Readings that agree before a release."""
+RELEASE, MOST = 6, 60
+"""Least readings that agree before a release, and readings from which on the mean decides at the latest."""
 OUTLIER = 4.0
 """Standard deviations of a single reading that disagrees, 1."""
 AGREES = 3.0
@@ -78,10 +79,12 @@ def follow(modes: Modes, masked: Masked, full: Full, m: Floats, seen: Bools | No
     fits = off * off <= OUTLIER**2 * (slow + d)
     count = np.where(read, np.where(fits, masked.count + 1, 0), masked.count)
     total = np.where(read, np.where(fits, masked.total + off, 0.0), masked.total)
-    full_count, n = count >= RELEASE, np.maximum(count, 1)
+    n = np.maximum(count, 1)
+    sharp = (count >= RELEASE) & (d <= n * slow)
     agrees = (total / n) ** 2 <= AGREES**2 * (slow + d / n)
+    full_count = count >= MOST
     return Masked(
-        masked.meters & ~(full_count & agrees),
+        masked.meters & ~((full_count | sharp) & agrees),
         np.where(full_count, 0, count),
         np.where(full_count, 0.0, total),
     )

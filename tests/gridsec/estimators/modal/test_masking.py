@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle  # the states of this test only
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -48,11 +49,31 @@ def test_named_meters_are_masked_and_released(kernel: Core, share: float) -> Non
     assert masked[199] == []
     assert masked[215] == [FIRST]
     assert masked[280] == [FIRST, SECOND]
-    assert masked[360 + masking.RELEASE // 2] == [FIRST, SECOND]
-    assert masked[599] == [SECOND]
+    assert masked[360 + masking.RELEASE - 2] == [FIRST, SECOND]
+    assert masked[360 + 2 * masking.MOST] == masked[599] == [SECOND]
     assert len(alarms) < 30
     truth = abs(core.estimate(kernel, state).mean[MODEL.meters[SECOND]])
     assert truth < 0.02
+
+
+@pytest.mark.parametrize("noise, ticks", [(0.5, masking.RELEASE), (9.5, 10), (1e6, masking.MOST)])
+def test_a_release_takes_readings_until_their_mean_is_sharp(kernel: Core, noise: float, ticks: int) -> None:
+    """White variances of 0.5 to 1e6 times the variance of the filter; one reading in between disagrees."""
+    p = kernel.modes.size
+    quiet = SimpleNamespace(noise=noise * np.eye(p))
+    mean, variance, meter = np.zeros((2, p)), np.ones(p), np.eye(p)[FIRST]
+    full = SimpleNamespace(mean=mean, variance=variance)
+    masked, far = masking.added(masking.none(kernel.modes), meter > 0.0), 10.0 * np.sqrt(1.0 + noise) * meter
+    for k, m in enumerate([np.zeros(p), far, *ticks * [np.zeros(p)]]):
+        assert masked.meters[FIRST], k
+        masked = masking.follow(quiet, masked, full, m, None)
+    assert not masked.meters.any()
+    masked = masking.added(masked, meter > 0.0)
+    # A mean beyond `AGREES` of its deviations releases nothing.
+    for _ in range(masking.MOST + 1):
+        off = 1.2 * masking.AGREES * np.sqrt(1.0 + noise / masking.RELEASE) * meter
+        masked = masking.follow(quiet, masked, full, off, None)
+    assert masked.meters[FIRST]
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2])
