@@ -517,7 +517,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         suspected=suspected,
         explanations=rivals,
         suspicion=state.suspicion,
-        settled=_settled(front, tick.predicted),
+        settled=_settled(design, tick.predicted),
         inverters=inverters,
         busbar=busbar.named,
         metered=np.atleast_1d(np.asarray(tick.measured.busbar_metered)),
@@ -601,9 +601,10 @@ def _injection_error(
     return error.reset((front.meter_of >= 0) & new[front.meter_of]) if any_of(new) else error
 
 
-def _settled(front: SequentialDesign, predicted: Prediction) -> bool:
-    """The observer's initial transient is a small part of the meters' accuracy."""
-    return all_of(predicted.transient <= front.options.settled * front.allowed)
+def _settled(design: ModalDesign, predicted: Prediction) -> bool:
+    """The observer's initial transient is a small part of the error at which a reading stands out."""
+    seen = design.front.allowed + JUMP * design.core.modes.noise_std
+    return all_of(predicted.transient <= design.options.settled * seen)
 
 
 def _busbar(
