@@ -1,7 +1,7 @@
 """Powers that are older than the voltages beside them, with kettles and charging cars, and no manipulation.
 
-    python -m benchmarks.late_powers [runs] [minutes]
-    python -m benchmarks.late_powers [runs] [minutes] --unchanged
+    python -m benchmarks.late_powers [runs] [minutes] [--estimator NAME]
+    python -m benchmarks.late_powers [runs] [minutes] [--estimator NAME] --unchanged
 
 Kerber Dorfnetz without inverters, one reading per second, AC power flow as the truth. Every household
 switches a kettle of 2 kW for 150 s, every ten minutes on average; every fifth customer, with a connection of
@@ -37,7 +37,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import PowerAges, Site, Snapshot, from_tables, load, to_frame
-from feeders.registry import DesignedEstimator, design
+from feeders.registry import SEQUENTIAL, DesignedEstimator, choose, design
 from feeders.simulation.demand import Customers, Variation
 from feeders.simulation.powerflow import PowerFlow
 from feeders.simulation.scenario import START
@@ -87,9 +87,9 @@ def site(interval_s: float) -> Site:
 
 
 @lru_cache(maxsize=4)
-def watcher(interval_s: float) -> DesignedEstimator:
-    """The default monitor of that feeder."""
-    return design(site(interval_s))
+def watcher(interval_s: float, estimator: str = SEQUENTIAL) -> DesignedEstimator:
+    """A monitor of that feeder."""
+    return design(choose(site(interval_s), estimator=estimator))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,7 +152,9 @@ def ages(seed: int, how: str, ticks: int, count: int) -> Floats:
     return np.full((ticks, count), LATE_S if how == "late" else 0.0)
 
 
-def run(seed: int, duration_s: int, how: str, stated: str) -> tuple[Counter[str], float, float]:
+def run(  # one run, and the monitor
+    seed: int, duration_s: int, how: str, stated: str, estimator: str = SEQUENTIAL
+) -> tuple[Counter[str], float, float]:
     """Counts of one run, and its largest error over the standard deviation and over the bound.
 
     Parameters
@@ -161,9 +163,11 @@ def run(seed: int, duration_s: int, how: str, stated: str) -> tuple[Counter[str]
         As in `world`.
     how, stated
         Ages of the powers, and the place that states them.
+    estimator
+        A name of the registry.
     """
     interval = LATE_S if stated == "p_interval_s" else 0.0
-    where, made, truth = site(interval), watcher(interval), world(seed, duration_s)
+    where, made, truth = site(interval), watcher(interval, estimator), world(seed, duration_s)
     age, random = ages(seed, how, truth.t.size, truth.v.shape[1]), np.random.default_rng([seed, 62])
     liars, sign = (
         random.permutation(truth.v.shape[1]) < truth.v.shape[1] // 3,
@@ -197,7 +201,9 @@ def run(seed: int, duration_s: int, how: str, stated: str) -> tuple[Counter[str]
     return seen, of_std, of_bound
 
 
-def unchanged(seed: int, duration_s: int, kind: str, count: int) -> tuple[Counter[str], float, float]:
+def unchanged(  # one run, and the monitor
+    seed: int, duration_s: int, kind: str, count: int, estimator: str = SEQUENTIAL
+) -> tuple[Counter[str], float, float]:
     """Counts of a run with unchanged powers; its largest error over the standard deviation and the bound.
 
     Parameters
@@ -206,8 +212,10 @@ def unchanged(seed: int, duration_s: int, kind: str, count: int) -> tuple[Counte
         As in `world`.
     kind, count
         "empty" or "stuck", and the number of its customers.
+    estimator
+        A name of the registry.
     """
-    where, made, truth = site(LATE_S), watcher(LATE_S), world(seed, duration_s)
+    where, made, truth = site(LATE_S), watcher(LATE_S, estimator), world(seed, duration_s)
     customers = truth.v.shape[1]
     which = np.random.default_rng([seed, 63]).permutation(customers)[:count]
     age, ages_of, state = ages(seed, "held", truth.t.size, customers), PowerAges(where), made.init(START)
@@ -228,7 +236,7 @@ def unchanged(seed: int, duration_s: int, kind: str, count: int) -> tuple[Counte
     return seen, of_std, of_bound
 
 
-def without_change(runs: int, minutes: int) -> int:
+def without_change(runs: int, minutes: int, estimator: str) -> int:
     """Print the table of unchanged powers; 1 if a limit is missed."""
     print(
         "| unchanged | customers | runs | honest named | CLEAN % | UNDECIDED % | in std | in bounds |\n|",
@@ -239,7 +247,7 @@ def without_change(runs: int, minutes: int) -> int:
     for kind, count in UNCHANGED:
         all_, of_std, of_bound = Counter[str](), 0.0, 0.0
         for seed in range(runs):
-            seen, std, bound = unchanged(seed, 60 * minutes, kind, count)
+            seen, std, bound = unchanged(seed, 60 * minutes, kind, count, estimator)
             all_ += seen
             of_std, of_bound = max(of_std, std), max(of_bound, bound)
         ticks = runs * minutes * 60
@@ -251,7 +259,7 @@ def without_change(runs: int, minutes: int) -> int:
     return 0 if good else 1
 
 
-def main(runs: int, minutes: int) -> int:
+def main(runs: int, minutes: int, estimator: str) -> int:
     """Print a table; 1 if a limit is missed."""
     print(
         "| powers | stated | runs | with honest named | honest named | CLEAN % | UNDECIDED % | ATTACKED % |",
@@ -262,7 +270,7 @@ def main(runs: int, minutes: int) -> int:
     for how, stated in CASES:
         all_, of_std, of_bound = Counter[str](), 0.0, 0.0
         for seed in range(runs):
-            seen, std, bound = run(seed, 60 * minutes, how, stated)
+            seen, std, bound = run(seed, 60 * minutes, how, stated, estimator)
             all_ += seen
             of_std, of_bound = max(of_std, std), max(of_bound, bound)
         share = [f"{100.0 * all_[each] / all_['ticks']:.1f}" for each in Decision]
@@ -275,5 +283,5 @@ def main(runs: int, minutes: int) -> int:
 
 
 if __name__ == "__main__":
-    asked = arguments(__doc__, runs=20, minutes=10, unchanged=False)
-    sys.exit((without_change if asked.unchanged else main)(asked.runs, asked.minutes))
+    asked = arguments(__doc__, runs=20, minutes=10, estimator=SEQUENTIAL, unchanged=False)
+    sys.exit((without_change if asked.unchanged else main)(asked.runs, asked.minutes, asked.estimator))

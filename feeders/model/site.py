@@ -680,6 +680,8 @@ def load_doubt(site: Site) -> LoadDoubt:
         common_q=ALIKE if np.isnan(told_q[site.meters]).any() else 0.0,
         lasting=1.0 if by_limits else 0.0,
         together=np.where(open_, ALIKE, 0.0) if open_.any() else 0.0,
+        sudden_p=changed if changed.any() else None,
+        sudden_q=loads.tan_max * changed if changed.any() else None,
     )
 
 

@@ -2,7 +2,8 @@
 
 The model of the residuals is fixed by the feeder's files. A frame may know less: a power without a reading,
 an interval far wider than the files state, an inverter that has not settled, a missing busbar voltage, a
-clock offset. Each such error d moves the residuals along one known column a, with unknown time dependence:
+clock offset. Where the files state that powers are older than their voltages (`LoadDoubt.sudden_p`), each
+frame does. Each such error d moves the residuals along one known column a, with unknown time dependence:
 
     m_t = w_t + b_t + e_t + f_t + A_t d_t
 
@@ -110,21 +111,25 @@ def _powers(
     design: SequentialDesign, measured: Measurements, uncertainty: FrameUncertainty, predicted: Prediction
 ) -> list[Floats]:
     """Directions of powers and injections, none or (n, k)."""
-    unsettled = _unsettled(design, predicted, measured.uses_q)
-    if uncertainty.usual and unsettled is None:
+    unsettled, doubt = _unsettled(design, predicted, measured.uses_q), design.doubt
+    if uncertainty.usual and unsettled is None and doubt.sudden_p is None:
         return []
-    frame, doubt = usual(measured.frame), design.doubt
-    p = _wider(frame.p_error, doubt.p, uncertainty.p[0])
-    q = _wider(frame.q_error, doubt.q, uncertainty.q[0])
+    frame, smooth = usual(measured.frame), doubt.smooth
+    p = _wider(frame.p_error, smooth.p, uncertainty.p[0] > 1.0, doubt.sudden_p)
+    q = _wider(frame.q_error, smooth.q, uncertainty.q[0] > 1.0, doubt.sudden_q)
     power = np.concatenate([p, q if unsettled is None else np.hypot(q, unsettled)])
     which = indices(power > 0.0)
     return [design.sensitivities.numbered(which) * power[which]] if which.size else []
 
 
-def _wider(error: Floats, known: Floats, factor: Floats) -> Floats:
-    """Standard deviations of the parts of powers' errors that the design does not contain, (N,), pu."""
+def _wider(error: Floats, known: Floats, wider: Bools, sudden: Floats | None) -> Floats:
+    """Standard deviations of the parts of powers' errors that the model does not contain, (N,), pu.
+
+    error, known: half-widths of the frame, and standard deviations of the model, (N,), pu. They count where
+    the frame is wider than the design, and where a part of the power is sudden.
+    """
     more = np.maximum(error * error / 3.0 - np.maximum(known, EXACT) ** 2, 0.0)
-    return np.where(factor > 1.0, np.sqrt(more), 0.0)
+    return np.where(wider if sudden is None else wider | (sudden > 0.0), np.sqrt(more), 0.0)
 
 
 def _unsettled(design: SequentialDesign, predicted: Prediction, metered: Bools) -> Floats | None:

@@ -183,9 +183,10 @@ def residual_model(design: SequentialDesign) -> ResidualModel:
     ----------
     design
         Design of the front end. Its prior counts the class of the busbar's meter among the loads; here it is
-        an error that lasts.
+        an error that lasts. Parts of powers that change within a tick are no part of the model, but unknown
+        directions of every frame (`gridsec.estimators.modal.doubts`).
     """
-    feeder, doubt, meters = design.plant.feeder, design.doubt, design.prior.meters
+    feeder, doubt, meters = design.plant.feeder, design.doubt.smooth, design.prior.meters
     loads = voltage_prior(feeder, meters, doubt, busbar=0.0, inverters=design.injections)
     phases = design.busbar_incidence.shape[1]
     places = np.arange(loads.variance.size)

@@ -606,6 +606,9 @@ class LoadDoubt:
     together : (N,) or one for all
         Share of both variances in phase with that of all others, 0 to 1: unmetered loads are low together by
         night, active and reactive.
+    sudden_p, sudden_q : (N,)
+        Parts of p and q that may come and go within a tick, as a power older than its voltage, pu; None for
+        none. `gridsec.estimators.modal.doubts` takes them as unknown at every tick.
     even_p, even_q : (N,)
         Derived: half-widths of uniform errors with standard deviations p and q, pu.
 
@@ -622,14 +625,16 @@ class LoadDoubt:
     common_q: float = 0.0
     lasting: float = 0.0
     together: Floats | float = 0.0
+    sudden_p: Floats | None = None
+    sudden_q: Floats | None = None
     even_p: Floats = field(init=False, repr=False)
     even_q: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         problems = [
             Problem("negative", f"{name} must be finite and not negative")
-            for name in ("p", "q")
-            if not (np.isfinite(getattr(self, name)).all() and (getattr(self, name) >= 0).all())
+            for name in ("p", "q", "sudden_p", "sudden_q")
+            if not _sizes(getattr(self, name))
         ]
         if not 0 < self.time_s <= LONGEST_S:
             most = f"at most {LONGEST_S:g}; what never changes is `lasting`"
@@ -644,6 +649,21 @@ class LoadDoubt:
         raise_if_any(problems)
         for name, std in (("even_p", self.p), ("even_q", self.q)):
             object.__setattr__(self, name, np.sqrt(3.0) * np.maximum(std, EXACT))
+
+    @property
+    def smooth(self) -> LoadDoubt:
+        """The same without the sudden parts."""
+        if self.sudden_p is None or self.sudden_q is None:
+            return self
+        p, q = self.p**2 - self.sudden_p**2, self.q**2 - self.sudden_q**2
+        return replace(
+            self, p=np.sqrt(np.maximum(p, 0.0)), q=np.sqrt(np.maximum(q, 0.0)), sudden_p=None, sudden_q=None
+        )
+
+
+def _sizes(values: Floats | None) -> bool:
+    """All finite and not negative."""
+    return values is None or bool(np.isfinite(values).all() and (values >= 0).all())
 
 
 def voltage_prior(

@@ -19,7 +19,12 @@ from feeders.model.site import (
     load_doubt,
     to_frame,
 )
+from feeders.registry import MODAL, choose, design
+from gridsec.estimators.modal.doubts import Unknown, unknown
+from gridsec.estimators.modal.monitor import ModalDesign, init
 from gridsec.estimators.sequential.design import SequentialOptions
+from gridsec.estimators.sequential.measurements import measurements, update_uncertainty
+from gridsec.estimators.sequential.step import predict
 from gridsec.interface import PowerOrigin
 from tests.feeders.model.test_forecast import forecasting
 
@@ -116,11 +121,42 @@ def test_a_stated_interval_is_in_design_and_frames_alike(site: Site) -> None:
     older = to_frame(where, said(where, age=90.0))
     assert older.p_origin is not None
     assert (older.p_origin == PowerOrigin.LATE).all()
+    one, other = load_doubt(where).smooth, load_doubt(site)
+    np.testing.assert_allclose(one.p, other.p)
+    np.testing.assert_allclose(one.q, other.q)
+    assert one.smooth is one
+    assert other.sudden_p is one.sudden_p is None
+
+
+def directions(site: Site, age: float) -> tuple[ModalDesign, Unknown]:
+    """Unknown directions of a first frame with powers of 1 kW of an age, s."""
+    made = design(choose(site, estimator=MODAL)).design
+    assert isinstance(made, ModalDesign)
+    front, state, frame = made.front, init(made, T).front, to_frame(site, said(site, 1.0, age))
+    measured = measurements(front, frame, state.trust.trusted, state.busbar.trusted, state.v0_squared)
+    uncertainty = update_uncertainty(front, state.uncertainty, frame, measured.available, True)
+    found = unknown(front, measured, uncertainty, predict(front, state, measured, uncertainty.sizes), None)
+    assert found is not None
+    return made, found
+
+
+def test_powers_of_a_stated_age_are_unknown_directions_of_every_frame(site: Site) -> None:
+    """Each has the standard deviation of the frame beyond that of fresh powers."""
+    where = stating(site, 60.0)
+    (made, late), (_, fresh) = (directions(where, age) for age in (np.nan, 0.0))
+    front, told = made.front, to_frame(where, said(where, 1.0, np.nan)).p_std
+    assert told is not None
+    at, first = front.prior.meters[0], np.array([0])
+    beyond = np.sqrt(told[0] ** 2 - front.doubt.smooth.p[0] ** 2)
+    assert late.places[at, 0] == pytest.approx(front.sensitivities.numbered(first)[at, 0] * beyond)
+    assert late.places.shape[1] == 2 * site.meters.size
+    # Fresh reactive powers are a little less certain than in the design.
+    assert np.abs(fresh.places).max() < 0.2 * np.abs(late.places).max()
 
 
 @pytest.mark.canary("p_interval_s")
 @pytest.mark.parametrize("stated", ["t_power", "p_interval_s"])
-def test_kettles_and_cars_accuse_nobody_once_the_age_is_stated(stated: str) -> None:
+def test_kettles_and_cars_accuse_no_meter_once_the_age_is_stated(stated: str) -> None:
     """Powers 60 s old: without the age honest meters are named in these runs, with it none."""
     assert run(0, 600, "late", "")[0]["honest"] + run(1, 600, "late", "")[0]["honest"] > 0
     for seed in (0, 1):
@@ -130,6 +166,15 @@ def test_kettles_and_cars_accuse_nobody_once_the_age_is_stated(stated: str) -> N
         if stated == "p_interval_s":
             assert seen["named"] == seen["liars"]
             assert seen["clean"] == seen["ticks"]
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.acceptance)])
+def test_kettles_and_cars_are_no_evidence_for_modal_once_the_age_is_stated(seed: int) -> None:
+    """Loads that change by up to 11 kW within a tick; then a third of the meters is off by 3 %."""
+    seen, _, of_bound = run(seed, 300, "late", "p_interval_s", MODAL)
+    assert (seen["clean"], seen["honest"]) == (seen["ticks"], 0)
+    assert seen["named"] == seen["liars"]
+    assert of_bound <= 1.0
 
 
 def test_an_unchanged_power_has_the_age_of_its_first_reading(site: Site) -> None:

@@ -56,7 +56,7 @@ def test_named_meters_are_masked_and_released(kernel: Core, share: float) -> Non
     assert truth < 0.02
 
 
-@pytest.mark.parametrize("noise, ticks", [(0.5, masking.RELEASE), (9.5, 10), (1e6, masking.MOST)])
+@pytest.mark.parametrize(("noise", "ticks"), [(0.5, masking.RELEASE), (9.5, 10), (1e6, masking.MOST)])
 def test_a_release_takes_readings_until_their_mean_is_sharp(kernel: Core, noise: float, ticks: int) -> None:
     """White variances of 0.5 to 1e6 times the variance of the filter; one reading in between disagrees."""
     p = kernel.modes.size
