@@ -1,7 +1,7 @@
 """Powers that are older than the voltages beside them, with kettles and charging cars, and no manipulation.
 
-    python -m benchmarks.late_powers [runs] [minutes] [--estimator NAME]
-    python -m benchmarks.late_powers [runs] [minutes] [--estimator NAME] --unchanged
+    python -m benchmarks.late_powers [runs] [minutes] [estimator]
+    python -m benchmarks.late_powers [runs] [minutes] [estimator] --unchanged
 
 Kerber Dorfnetz without inverters, one reading per second, AC power flow as the truth. Every household
 switches a kettle of 2 kW for 150 s, every ten minutes on average; every fifth customer, with a connection of

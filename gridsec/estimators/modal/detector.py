@@ -210,7 +210,8 @@ def step(
 ) -> tuple[Detector, Evidence]:
     """Take in one step of the filter and evaluate M, if that is due.
 
-    All onsets are evaluated at every `EVERY`-th tick. Young and pinned ones are evaluated at every tick while
+    All onsets are evaluated at the first `EVERY` ticks, and then at every `EVERY`-th: no verdict after a start
+    rests on nothing. Young and pinned ones are evaluated at every tick while
     an onset is pinned, while log M was above `alert`, where a reading is missing, and where one innovation
     stands out by itself. Powers
     are evaluated at every `EVERY`-th tick and while an onset is pinned: an alarm by them alone lasts. The
@@ -238,7 +239,7 @@ def step(
         begun.append(_STEPS + int(free[_STEPS:].argmin()))
         capital[:, begun[1]] = log(RAMPS * RAMP_EVERY)
     onsets = signatures.follow(modes, before.onsets, update, static, h, begun=begun, ended=ended)
-    full, suspected = ticks % EVERY == 0, any_of(before.pinned)
+    full, suspected = ticks <= EVERY or ticks % EVERY == 0, any_of(before.pinned)
     least = precision(modes, before.precision, update)
     always = full or suspected or update.seen is not None or before.log_m >= alert
     if not (always or _stands_out(modes, update, static, least)):
