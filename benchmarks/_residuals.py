@@ -200,7 +200,7 @@ class Dense:
         return self.mean[self.p : 2 * self.p] + self.mean[2 * self.p : 3 * self.p]
 
     def step(
-        self, h: float, m: Floats, seen: Bools | None = None, level: float = 1.0
+        self, h: float, m: Floats, seen: Bools | None = None, level: float = 1.0, aged: float = 0.0
     ) -> tuple[Floats, Floats]:
         """One tick: innovations of the meters with a reading, and their covariance.
 
@@ -214,9 +214,11 @@ class Dense:
             Meters with a reading; None: all.
         level
             Level of the faults at this tick: 0 before their onset.
+        aged
+            Time by which w ages besides, s.
         """
         p, k = self.p, self.k
-        rho, rho_b = exp(-h / self.model.time_s), exp(-h / self.model.fixed_s)
+        rho, rho_b = exp(-(h + aged) / self.model.time_s), exp(-h / self.model.fixed_s)
         F = np.concatenate([np.full(p, rho), np.full(p, rho_b), np.ones(p + k)])
         self.mean = F * self.mean
         both = np.outer(F, F)

@@ -20,11 +20,21 @@ The estimate uses the standard deviations themselves: d is estimated from the re
     d_hat = A_n' (A_n A_n' + D_n)^-1 u_n,   u = m - E[w + b],
 
 n being the meters with a reading.
+
+**Loads that jump.** The error of a power follows the power. Where its half-width, and the reactive power that
+the model adds, change by c_j from one frame to the next, the error has changed by a number of the variance
+c_j^2 / 3. With the design's deviations s_j, without common parts,
+
+    sum_j a_j a_j' c_j^2 / 3  <=  r S,   r = max_j c_j^2 / (3 s_j^2).
+
+The errors of all loads therefore age by the time in which an AR(1) process renews the share r of its
+variance, ``-T log(1 - r) / 2``: w keeps its covariance S, whatever the powers do.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import log1p, sqrt
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -36,11 +46,16 @@ from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.measurements import ClockSkew, FrameUncertainty, Measurements
 from gridsec.estimators.sequential.posterior import EXACT, UNMETERED
 from gridsec.estimators.sequential.state import Prediction
+from gridsec.interface import Frame, PowerOrigin
 
 WIDER = 10.0
 """Factor on the standard deviations of unknown directions, 1: a lasting error leaves 1 % of its evidence."""
 UNSETTLED = 4.0
 """Ratio of an injection's error to the design's from which on the injection is unknown, 1."""
+NOTICED = 0.5
+"""Change of a voltage, in white deviations, from which on a changed power counts as a load that jumps, 1."""
+RENEWED = 0.99
+"""Largest share of the loads' variance that a tick renews, 1."""
 SKEWED = 0.5
 """Change of a voltage within a clock offset from which on the reading is unknown, in white deviations, 1."""
 
@@ -105,6 +120,53 @@ def unknown(
         whole = np.hstack([whole, np.zeros((places, clocks.shape[1]))])
         meters = np.hstack([meters, clocks])
     return Unknown(whole, meters, measured.available & ~uncertainty.vouched[0])
+
+
+def reach(design: SequentialDesign) -> Floats:
+    """Largest effect of each power on a meter, in its white deviations per pu, (2 N,).
+
+    Parameters
+    ----------
+    design
+        The front end.
+    """
+    columns = design.sensitivities.numbered(np.arange(2 * design.customers))[design.prior.meters]
+    return np.asarray((np.abs(columns) / np.sqrt(design.white)[:, None]).max(axis=0))
+
+
+def aging(
+    design: SequentialDesign, reach: Floats, time_s: float, before: Frame | None, measured: Measurements
+) -> float:
+    """Time by which the errors of the loads age beyond the interval, since powers have changed, s.
+
+    The reactive error of a load that is switched on may be all of the reactive power that the model adds.
+
+    Parameters
+    ----------
+    design, reach
+        The front end, and the reach of its powers.
+    time_s
+        T of the loads, s.
+    before, measured
+        The last frame, and the measurements of this one.
+    """
+    if before is None:
+        return 0.0
+    frame, N, root = measured.frame, design.customers, sqrt(3.0)
+    changed = np.empty(2 * N)
+    np.abs(frame.p_error - before.p_error, out=changed[:N])
+    np.add(np.abs(frame.q_error - before.q_error), np.abs(frame.q - before.q), out=changed[N:])
+    noticed = changed * reach > root * NOTICED
+    if not any_of(noticed):
+        return 0.0
+    noticed[N:] &= ~measured.uses_q
+    for origin in (frame.p_origin, before.p_origin):
+        if origin is not None:
+            # Powers that are back, or that are missing now, have not jumped.
+            noticed &= np.tile(origin == PowerOrigin.READ, 2)
+    smooth = design.doubt.smooth
+    ratio = changed[noticed] / (root * np.maximum(np.concatenate([smooth.p, smooth.q])[noticed], EXACT))
+    return -0.5 * time_s * log1p(-min(float(ratio.max(initial=0.0)) ** 2, RENEWED))
 
 
 def _powers(

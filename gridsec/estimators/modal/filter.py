@@ -8,8 +8,9 @@ With ``z = U' m`` of `gridsec.estimators.modal.model`, each mode has the states 
               (w, b) += k nu,  P -= v k k'
 
 where q and s are the variances of w and b, ``rho = exp(-h / T)``, ``rho_b = exp(-h / T_b)`` for an interval
-of h seconds. The cost is O(t) and the product ``U' m``. The filter is exact for ``B = kappa D``, and
-with `gridsec.estimators.modal.static` for every B.
+of h seconds. The errors of the loads may age by more than h (`gridsec.estimators.modal.doubts`). The cost is
+O(t) and the product ``U' m``. The filter is exact for ``B = kappa D``, and with
+`gridsec.estimators.modal.static` for every B.
 
 **Missing readings** couple the modes: `gridsec.estimators.modal.full` follows the exact filter then. The
 covariance here stays that of complete readings. It is a lower bound of the exact one: ``diag(1 / v)`` is
@@ -30,6 +31,26 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, Ints, all_of
 from gridsec.errors import InputInvalid, Problem
 from gridsec.estimators.modal.model import Modes
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """Interval between two ticks.
+
+    Attributes
+    ----------
+    h
+        Its length, s.
+    aged
+        Time by which the errors of the loads age besides, s.
+    """
+
+    h: float
+    aged: float = 0.0
+
+    def decay(self, modes: Modes) -> tuple[float, float]:
+        """Factors rho and rho_b."""
+        return exp(-(self.h + self.aged) / modes.model.time_s), exp(-self.h / modes.model.fixed_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,8 +202,8 @@ def start(modes: Modes, t: float) -> FilterState:
     return FilterState(t, np.zeros((2, modes.size)), np.stack([modes.varying, zero, modes.lasting]))
 
 
-def step(
-    modes: Modes, state: FilterState, t: float, m: Floats, seen: Bools | None = None
+def step(  # noqa: PLR0917  # the state, and one tick
+    modes: Modes, state: FilterState, t: float, m: Floats, seen: Bools | None = None, aged: float = 0.0
 ) -> tuple[FilterState, Update]:
     """Take in the residuals of one tick.
 
@@ -196,6 +217,8 @@ def step(
         Residuals of the members, squared pu; any finite value where not seen.
     seen : (t,)
         Members with a reading; None: all.
+    aged
+        Time by which the errors of the loads age besides, s.
 
     Raises
     ------
@@ -205,7 +228,7 @@ def step(
     h = t - state.t
     if not h >= 0.0:
         raise InputInvalid([Problem("order", f"t is {t}; it must not be before {state.t}")])
-    rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
+    rho, rho_b = Interval(h, aged).decay(modes)
     cov, shared, v = predicted(modes, state.cov, rho, rho_b)
     whole = seen is None or all_of(seen)
     gain, mean, nu = shared / v, state.mean, np.zeros(v.size)

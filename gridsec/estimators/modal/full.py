@@ -35,7 +35,6 @@ Anderson and Moore, Optimal Filtering, 1979, chapter 3.
 from __future__ import annotations
 
 from dataclasses import replace
-from math import exp
 
 import numpy as np
 from scipy.linalg import blas, lapack
@@ -43,7 +42,7 @@ from scipy.linalg import blas, lapack
 from gridsec.arrays import Bools, Floats, Ints, all_of, changed, indices, submatrix
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal import static
-from gridsec.estimators.modal.filter import FilterState, Full, Innovation, Update
+from gridsec.estimators.modal.filter import FilterState, Full, Innovation, Interval, Update
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.static import Static
 
@@ -65,6 +64,7 @@ def step(  # noqa: PLR0917  # the states of both parts, and one tick
     *,
     stay: bool = False,
     unknown: Floats | None = None,
+    aged: float = 0.0,
 ) -> tuple[FilterState, Static, Update]:
     """Take in the residuals of one tick by the exact filter.
 
@@ -83,6 +83,8 @@ def step(  # noqa: PLR0917  # the states of both parts, and one tick
     unknown : (t, k)
         Directions of the residuals that are unknown at this tick, times their standard deviations; None for
         none.
+    aged
+        Time by which the errors of the loads age besides the interval, s.
 
     Raises
     ------
@@ -94,9 +96,10 @@ def step(  # noqa: PLR0917  # the states of both parts, and one tick
         state, known = _returned(modes, state, state.full, known)
     if state.full is None and not whole:
         state = replace(state, full=expanded(modes, state, known))
-    after, update = modal.step(modes, state, t, m, seen)
+    after, update = modal.step(modes, state, t, m, seen, aged)
     if state.full is not None:
-        full, innovation = updated(modes, state.full, t - state.t, m, None if whole else seen, unknown)
+        gap = Interval(t - state.t, aged)
+        full, innovation = updated(modes, state.full, gap, m, None if whole else seen, unknown)
         score = innovation.score @ modes.back[innovation.rows]
         share, since = _share(modes, state.full, update)
         kept, slower = _kept(modes, full.kept, update, share)
@@ -133,7 +136,7 @@ def _turned(modes: Modes, known: Static) -> Floats:
 def updated(  # noqa: PLR0917  # the filter, and one tick
     modes: Modes,
     before: Full,
-    h: float,
+    gap: Interval,
     m: Floats,
     seen: Bools | None,
     unknown: Floats | None = None,
@@ -144,15 +147,15 @@ def updated(  # noqa: PLR0917  # the filter, and one tick
     ----------
     modes, before
         The modes, and the filter after the last tick.
-    h
-        Interval, s.
+    gap
+        The interval.
     m, seen : (t,)
         Residuals, and members with a reading; None: all.
     unknown : (t, k)
         As in `step`: ``unknown unknown'`` is added to the covariance of the white errors of this tick.
     """
     t, rows = modes.size, np.arange(modes.size) if seen is None else indices(seen)
-    rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
+    rho, rho_b = gap.decay(modes)
     mean = before.mean * np.array([[rho], [rho_b]])
     w, both, b = before.blocks
     w, both, b = w * rho**2, both * (rho * rho_b), b * rho_b**2
@@ -190,19 +193,19 @@ def updated(  # noqa: PLR0917  # the filter, and one tick
     )
 
 
-def expected(modes: Modes, before: Full, h: float, rows: Ints) -> Floats:
+def expected(modes: Modes, before: Full, gap: Interval, rows: Ints) -> Floats:
     """Covariance of the innovation of the next tick, (n, n).
 
     Parameters
     ----------
     modes, before
         The modes, and the filter after the last tick.
-    h
-        Interval, s.
+    gap
+        The interval.
     rows : (n,)
         Members with a reading.
     """
-    rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
+    rho, rho_b = gap.decay(modes)
     w, both, b = (submatrix(each, rows, rows) for each in before.blocks)
     V = rho * rho * w + rho_b * rho_b * b
     V += rho * rho_b * (both + both.T) + submatrix(modes.noise, rows, rows)

@@ -112,10 +112,13 @@ class ModalDesign:
         Design of the front end.
     core
         The statistical core.
+    reach : (2 N,)
+        Largest effect of each power on a meter, as in `doubts.reach`.
     """
 
     front: SequentialDesign
     core: Core
+    reach: Floats = field(repr=False)
 
     @property
     def plant(self) -> Plant:
@@ -158,7 +161,7 @@ def design(
     `gridsec.estimators.sequential.design.design`, and its errors.
     """
     front = front_design(plant, doubt=doubt, step_s=step_s, options=options, max_attacked=max_attacked)
-    return ModalDesign(front, core.design(front, most))
+    return ModalDesign(front, core.design(front, most), doubts.reach(front))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -288,6 +291,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
         m,
         None if whole else seen,
         None if open_ is None else open_.wide,
+        doubts.aging(front, design.reach, design.core.model.time_s, given.frame, measured),
     )
     after, evidence = _identified(design, changed(state, front=now, core=kernel), evidence, measured.uses_q)
     if after.front.busbar is not now.busbar:
@@ -429,7 +433,7 @@ def confirmed(found: Identification, named: Bools, streak: Ints, since: Sequence
     """
     sole = np.flatnonzero(named)
     if sole.size == 1 and np.count_nonzero(found.chosen[0]) == 1:
-        readings = sum(seen is None or bool(seen[sole[0]]) for _, _, seen, _ in since)
+        readings = sum(seen is None or bool(seen[sole[0]]) for _, _, seen, *_ in since)
         if readings >= CONFIRM:
             return named
     return np.asarray(named & (streak >= CONFIRM))
@@ -655,22 +659,11 @@ def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Esti
         busbar=measured.busbar_metered,
         y=measured.y,
         trusted=sure,
-        checked=_Checked(front, measured.frame),
+        checked=partial(checked, front, measured.frame),
         sigmas=front.sigmas[0],
     )
     least = changed(spread, places=first, least=np.where(measured.busbar_metered, front.busbar**2, 0.0))
     return Reconstructed.later(inputs, measured.frame.t, v2_bus, least, tick.predicted.x), spread
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Checked:
-    """Meters with a known customer's power, (p,), evaluated with the bound."""
-
-    front: SequentialDesign
-    frame: Frame
-
-    def __call__(self) -> Bools:
-        return checked(self.front, self.frame)
 
 
 def own_errors(design: ModalDesign, state: CoreState) -> Floats:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from math import exp
 
 import numpy as np
 from scipy.linalg import blas
@@ -25,7 +24,7 @@ from gridsec.arrays import Bools, Floats
 from gridsec.estimators.modal import full as exact
 from gridsec.estimators.modal import signatures
 from gridsec.estimators.modal.detector import Detector
-from gridsec.estimators.modal.filter import FilterState, Full, Innovation
+from gridsec.estimators.modal.filter import FilterState, Full, Innovation, Interval
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.signatures import RAMP_S, Joint, Onsets
 from gridsec.estimators.modal.static import Static
@@ -36,8 +35,8 @@ HALF = 64
 NEAR = 16
 """Ticks from one to the next of the two youngest kept states: most onsets are named within so many ticks."""
 
-Reading = tuple[float, Floats, Bools | None, Floats | None]
-"""Time, residuals (t,), members with a reading (t,), and unknown directions (t, k) of a tick."""
+Reading = tuple[float, Floats, Bools | None, Floats | None, float]
+"""Time, residuals (t,), members with a reading (t,), unknown directions (t, k), and aging of the loads, s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,8 +102,13 @@ class History:
         return History(self.start, self.readings[:at], middle, recent), parts
 
 
-def record(
-    history: History, after: Parts, m: Floats, seen: Bools | None, unknown: Floats | None = None
+def record(  # noqa: PLR0917  # the state, and one tick
+    history: History,
+    after: Parts,
+    m: Floats,
+    seen: Bools | None,
+    unknown: Floats | None = None,
+    aged: float = 0.0,
 ) -> History:
     """Keep the readings of one tick.
 
@@ -118,8 +122,10 @@ def record(
         Residuals, and members with a reading.
     unknown : (t, k)
         Unknown directions.
+    aged
+        Time by which the errors of the loads age besides the interval, s.
     """
-    readings, recent = (*history.readings, (after[0].t, m, seen, unknown)), history.recent
+    readings, recent = (*history.readings, (after[0].t, m, seen, unknown, aged)), history.recent
     count, middle = len(readings), history.middle
     if count % NEAR == 0:
         recent = (*recent[-1:], (count, after))
@@ -144,12 +150,12 @@ def replayed(modes: Modes, history: History, onsets: Onsets, rows: Sequence[int]
     count, (state, known, *_) = len(history.readings), history.start
     t, full = state.t, exact.expanded(modes, state, known) if state.full is None else state.full
     out = {row: begun(modes, row, bool(onsets.ramp[row])) for row in rows}
-    for k, (now, m, seen, unknown) in enumerate(history.readings):
-        h = now - t
-        full, innovation = exact.updated(modes, full, h, m, seen, unknown)
+    for k, (now, m, seen, unknown, aged) in enumerate(history.readings):
+        gap = Interval(now - t, aged)
+        full, innovation = exact.updated(modes, full, gap, m, seen, unknown)
         for row in rows:
             if onsets.age[row] >= count - k:
-                out[row] = follow(modes, out[row], innovation, h)
+                out[row] = follow(modes, out[row], innovation, gap)
         t = now
     return tuple(out.values())
 
@@ -185,7 +191,7 @@ def carried(modes: Modes, onsets: Onsets, known: Static, rows: Sequence[int]) ->
     return tuple(out)
 
 
-def follow(modes: Modes, before: Suspected, innovation: Innovation, h: float) -> Suspected:
+def follow(modes: Modes, before: Suspected, innovation: Innovation, gap: Interval) -> Suspected:
     """Take in one tick; O(n t^2).
 
     Parameters
@@ -194,14 +200,14 @@ def follow(modes: Modes, before: Suspected, innovation: Innovation, h: float) ->
         The modes, and the scores so far.
     innovation
         The exact innovation of the tick.
-    h
-        Interval, s.
+    gap
+        The interval.
     """
     t, n = modes.size, innovation.rows
-    level = before.level + (h / RAMP_S if before.ramp else 0.0)
-    shift = before.shift.copy()
-    shift[:t] *= exp(-h / modes.model.time_s)
-    shift[t:] *= exp(-h / modes.model.fixed_s)
+    level = before.level + (gap.h / RAMP_S if before.ramp else 0.0)
+    shift, (rho, rho_b) = before.shift.copy(), gap.decay(modes)
+    shift[:t] *= rho
+    shift[t:] *= rho_b
     if not n.size:
         return replace(before, level=level, shift=shift)
     gamma = -(shift[n] + shift[t + n])

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import exp, log
+from math import log
 
 import numpy as np
 from scipy.linalg import lapack
@@ -36,7 +36,7 @@ from gridsec.arrays import Bools, Floats, all_of, indices, submatrix
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal import full as exact
 from gridsec.estimators.modal import replay, signatures
-from gridsec.estimators.modal.filter import FilterState, Update
+from gridsec.estimators.modal.filter import FilterState, Interval, Update
 from gridsec.estimators.modal.model import REPORTED_S, Modes
 from gridsec.estimators.modal.replay import History, Suspected
 from gridsec.estimators.modal.signatures import Joint, Onsets
@@ -163,17 +163,18 @@ def replayed(
     if older and (state.full is None or exactly is not None):
         begin, one = -1, signatures.single(had, row)
     out = [replace(each, onsets=one, suspected=exactly) for each in first(modes, others, history)]
-    for k, (t, m, seen, unknown) in enumerate(history.readings):
-        out = [follow(each, t, m, seen, unknown, begun=k == begin) for each in out]
+    for k, (t, m, seen, unknown, aged) in enumerate(history.readings):
+        out = [follow(each, t, m, seen, unknown, aged, begun=k == begin) for each in out]
     return tuple(out)
 
 
-def follow(
+def follow(  # noqa: PLR0917  # the state, and one tick
     before: Rival,
     t: float,
     m: Floats,
     seen: Bools | None,
     unknown: Floats | None = None,
+    aged: float = 0.0,
     *,
     begun: bool = False,
 ) -> Rival:
@@ -189,10 +190,12 @@ def follow(
         Residuals, and members with a reading; None: all.
     unknown : (p, k)
         Unknown directions, as in `gridsec.estimators.modal.full.step`.
+    aged
+        Time by which the errors of the loads age besides the interval, s.
     begun
         The onset is at this tick.
     """
-    modes, state, known, h = before.modes, before.filter, before.static, t - before.filter.t
+    modes, state, known, gap = before.modes, before.filter, before.static, Interval(t - before.filter.t, aged)
     total, onsets, suspected, jumps = before.sum, before.onsets, before.suspected, before.jumps
     if state.full is None and not ((seen is None or all_of(seen)) and unknown is None):
         total += _of_theta(modes, known) - before.known
@@ -201,22 +204,22 @@ def follow(
         state = replace(state, full=exact.expanded(modes, state, known))
     size = 0.0
     if jumps is not None:
-        size, prior = _jump(modes, state, known, h, m, seen, unknown)
+        size, prior = _jump(modes, state, known, gap, m, seen, unknown)
         total, jumps = total + prior, jumps + (size > 0.0)
-        state = _jumped(modes, state, h, size)
-    state, known, update = exact.step(modes, state, known, t, m, seen, stay=True, unknown=unknown)
+        state = _jumped(modes, state, gap, size)
+    state, known, update = exact.step(modes, state, known, t, m, seen, stay=True, unknown=unknown, aged=aged)
     if update.exact is None:
         total -= 0.5 * float((update.innovation**2 / update.variance + np.log(update.variance)).sum())
         if begun or onsets.used[0]:
-            onsets = signatures.follow(modes, onsets, update, known, h, begun=[0] if begun else [])
+            onsets = signatures.follow(modes, onsets, update, known, gap.h, begun=[0] if begun else [])
     else:
         half, white = update.exact.half, update.exact.white
         total -= 0.5 * float(white @ white) + float(np.log(half.diagonal()).sum())
         if begun:
             suspected = replay.begun(modes, 0, bool(onsets.ramp[0]))
         if suspected is not None:
-            suspected = replay.follow(modes, suspected, update.exact, h)
-    rho2 = exp(-2.0 * h / modes.model.time_s)
+            suspected = replay.follow(modes, suspected, update.exact, gap)
+    rho2 = gap.decay(modes)[0] ** 2
     loads = rho2 * before.loads + (1.0 - rho2) * before.unrest + size
     return replace(
         before,
@@ -244,13 +247,13 @@ def _jump(  # noqa: PLR0917  # the states of both parts, and one tick
     modes: Modes,
     state: FilterState,
     known: Static,
-    h: float,
+    gap: Interval,
     m: Floats,
     seen: Bools | None,
     unknown: Floats | None,
 ) -> tuple[float, float]:
     """The likeliest jump of a tick, in the variances of the loads, and the logarithm of its prior."""
-    rho, rho_b = exp(-h / modes.model.time_s), exp(-h / modes.model.fixed_s)
+    rho, rho_b = gap.decay(modes)
     scale = min(1.0, WITHIN_S / min(modes.model.time_s, REPORTED_S))
     sizes, priors = (
         (0.0, *(scale * each for each in JUMPS)),
@@ -269,7 +272,7 @@ def _jump(  # noqa: PLR0917  # the states of both parts, and one tick
         if not n.size:
             return 0.0, priors[0]
         nu = (m - rho * state.full.mean[0] - rho_b * state.full.mean[1])[n]
-        V, S = exact.expected(modes, state.full, h, n), submatrix(modes.jumps, n, n)
+        V, S = exact.expected(modes, state.full, gap, n), submatrix(modes.jumps, n, n)
         if unknown is not None:
             V = V + unknown[n] @ unknown[n].T
         each = []
@@ -281,11 +284,11 @@ def _jump(  # noqa: PLR0917  # the states of both parts, and one tick
     return sizes[best], priors[best]
 
 
-def _jumped(modes: Modes, state: FilterState, h: float, size: float) -> FilterState:
+def _jumped(modes: Modes, state: FilterState, gap: Interval, size: float) -> FilterState:
     """State before a tick at which the loads jump."""
     if not size:
         return state
-    more = size * exp(2.0 * h / modes.model.time_s)
+    more = size / gap.decay(modes)[0] ** 2
     cov, full = state.cov.copy(), state.full
     cov[0] += more * modes.loads
     if full is not None:

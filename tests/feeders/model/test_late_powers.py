@@ -20,6 +20,7 @@ from feeders.model.site import (
     to_frame,
 )
 from feeders.registry import MODAL, choose, design
+from gridsec.estimators.modal import doubts
 from gridsec.estimators.modal.doubts import Unknown, unknown
 from gridsec.estimators.modal.monitor import ModalDesign, init
 from gridsec.estimators.sequential.design import SequentialOptions
@@ -175,6 +176,48 @@ def test_kettles_and_cars_are_no_evidence_for_modal_once_the_age_is_stated(seed:
     assert (seen["clean"], seen["honest"]) == (seen["ticks"], 0)
     assert seen["named"] == seen["liars"]
     assert of_bound <= 1.0
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(0, marks=pytest.mark.acceptance)])
+def test_loads_that_jump_are_no_evidence_for_modal(seed: int) -> None:
+    """Powers of the moment: a car of 11 kW takes less reactive power than the model adds for it."""
+    seen, _, of_bound = run(seed, 240, "fresh", "", MODAL)
+    assert (seen["clean"], seen["honest"], seen["named"]) == (seen["ticks"], 0, seen["liars"])
+    assert of_bound <= 1.0
+
+
+def test_loads_age_where_their_reported_powers_jump(site: Site) -> None:
+    """By the time that renews the share of their variance; not where a power is missing, back or metered."""
+    made = design(choose(site, estimator=MODAL)).design
+    assert isinstance(made, ModalDesign)
+    front, state, time_s = made.front, init(made, T).front, made.core.model.time_s
+    j, root = int(made.reach[site.meters + front.customers].argmax()), np.sqrt(3.0)
+    silent = np.full(site.meters.size, np.nan)
+
+    def reading(kw: float, reported: float = np.nan) -> Snapshot:
+        p, q = np.ones(silent.size), silent.copy()
+        p[j], q[j] = kw, reported
+        return replace(said(site), p_kw=p, q_kvar=q)
+
+    def aged(before: Snapshot, now: Snapshot, factor: float = 10.0) -> float:
+        known, frame = state.trust.trusted, to_frame(site, now)
+        measured = measurements(front, frame, known, state.busbar.trusted, state.v0_squared)
+        return doubts.aging(front, factor * made.reach, time_s, to_frame(site, before), measured)
+
+    one, other, at = to_frame(site, reading(1.0)), to_frame(site, reading(4.0)), site.meters[j]
+    c = abs(one.q[at] - other.q[at]) + abs(one.q_error[at] - other.q_error[at])
+    share = (c / root / front.doubt.q[at]) ** 2
+    assert 0.0 < share < doubts.RENEWED
+    assert aged(reading(1.0), reading(4.0)) == pytest.approx(-0.5 * time_s * np.log(1.0 - share))
+    assert aged(reading(4.0), reading(1.0)) == aged(reading(1.0), reading(4.0))
+    # No meter would see it.
+    assert aged(reading(1.0), reading(4.0), 1.0) == 0.0
+    most = -0.5 * time_s * np.log(1.0 - doubts.RENEWED)
+    assert aged(reading(0.0), reading(site.tables.customers[at].load_kw)) == pytest.approx(most)
+    assert aged(reading(np.nan), reading(4.0)) == aged(reading(1.0), reading(np.nan)) == 0.0
+    assert aged(reading(1.0), reading(4.0, reported=0.3)) < aged(reading(1.0), reading(4.0))
+    frame = measurements(front, one, state.trust.trusted, state.busbar.trusted, state.v0_squared)
+    assert doubts.aging(front, made.reach, time_s, None, frame) == 0.0
 
 
 def test_an_unchanged_power_has_the_age_of_its_first_reading(site: Site) -> None:

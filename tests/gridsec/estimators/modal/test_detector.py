@@ -342,7 +342,7 @@ def test_the_precision_of_members_is_bounded_from_below(make: object) -> None:
 
 @pytest.mark.parametrize("silent", [3, None])
 def test_m_is_evaluated_at_every_tick_without_all_readings(silent: int | None) -> None:
-    """Calm readings: at the first `EVERY` ticks and at every `EVERY`-th; with a silent meter at every tick."""
+    """Calm readings: at the first `EVERY` ticks and at every `EVERY`-th. With a silent meter at every one."""
     made = modes(busbar())
     of = signatures.columns(made, power_columns(FEEDER), np.full(24, 0.05), 0.01)
     seen = np.arange(12) != silent

@@ -64,6 +64,30 @@ def test_equals_the_dense_filter_where_b_is_proportional(fixed_s: float) -> None
     assert close(covariance(made, state), dense.cov[: 2 * made.size, : 2 * made.size])
 
 
+@pytest.mark.parametrize("share", [0.0, 0.3])
+def test_loads_that_age_faster_are_those_of_the_dense_filter(share: float) -> None:
+    """The errors of the loads age by up to four time constants in a tick; also with missing readings."""
+    model, random = mixed(), np.random.default_rng(4)
+    made = modes(model)
+    state, more, dense = modal.start(made, 0.0), static.start(made), Dense(model)
+    for k in range(60):
+        aged, seen = float(random.choice([0.0, 100.0, 2400.0])), random.random(made.size) >= share
+        m = 0.01 * random.standard_normal(made.size)
+        state, more, update = full.step(
+            made, state, more, float(k), m, None if seen.all() else seen, aged=aged
+        )
+        nu, V = dense.step(float(k > 0), m, seen, aged=aged)
+        if update.exact is not None:
+            assert close(update.exact.half @ update.exact.white, nu)
+            assert close(update.exact.half @ update.exact.half.T, V)
+    assert (state.full is None) == (share == 0.0)
+    if state.full is None:
+        g_w = state.mean[0] - more.signature[0] * (made.directions @ more.theta)
+        assert close(made.back @ g_w, dense.varies, dense.varies)
+    else:
+        assert close(state.full.mean[0], dense.varies)
+
+
 @pytest.mark.parametrize("make", [model_of, mixed])
 @pytest.mark.parametrize("fixed_s", [np.inf, 3000.0])
 def test_directions_make_it_exact_for_every_b(make: object, fixed_s: float) -> None:
