@@ -200,7 +200,7 @@ class Dense:
         return self.mean[self.p : 2 * self.p] + self.mean[2 * self.p : 3 * self.p]
 
     def step(
-        self, h: float, m: Floats, seen: Bools | None = None, level: float = 1.0, aged: float = 0.0
+        self, h: float, m: Floats, seen: Bools | None = None, level: float = 1.0, jump: float = 0.0
     ) -> tuple[Floats, Floats]:
         """One tick: innovations of the meters with a reading, and their covariance.
 
@@ -214,15 +214,16 @@ class Dense:
             Meters with a reading; None: all.
         level
             Level of the faults at this tick: 0 before their onset.
-        aged
-            Time by which w ages besides, s.
+        jump
+            Variance of a jump of w, in that of w, 1.
         """
         p, k = self.p, self.k
-        rho, rho_b = exp(-(h + aged) / self.model.time_s), exp(-h / self.model.fixed_s)
+        rho, rho_b = exp(-h / self.model.time_s), exp(-h / self.model.fixed_s)
         F = np.concatenate([np.full(p, rho), np.full(p, rho_b), np.ones(p + k)])
         self.mean = F * self.mean
         both = np.outer(F, F)
         self.cov = both * self.cov + (1.0 - both) * np.where(np.arange(F.size) < 2 * p, self.prior, 0.0)
+        self.cov[:p, :p] += jump * self.prior[:p, :p]
         rows = np.arange(p) if seen is None else np.flatnonzero(seen)
         H = self.H[rows] * np.where(np.arange(F.size) < 3 * p, 1.0, level)
         V = H @ self.cov @ H.T + self.D[np.ix_(rows, rows)]

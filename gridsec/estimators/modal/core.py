@@ -283,7 +283,7 @@ def step(  # noqa: PLR0917  # the state, and one tick
     m: Floats,
     seen: Bools | None = None,
     unknown: Floats | None = None,
-    aged: float = 0.0,
+    jump: float = 0.0,
 ) -> tuple[CoreState, Evidence]:
     """Take in the residuals of one tick.
 
@@ -300,8 +300,8 @@ def step(  # noqa: PLR0917  # the state, and one tick
     unknown : (p, k)
         Directions of the residuals that are unknown at this tick, times their standard deviations; None for
         none. The tick says nothing about them where the standard deviations are large.
-    aged
-        Time by which the errors of the loads age besides the interval, s.
+    jump
+        Variance of a jump of the loads' errors, in that of the loads, 1.
 
     Raises
     ------
@@ -313,7 +313,7 @@ def step(  # noqa: PLR0917  # the state, and one tick
         seen = ~masked.meters if read is None else read & ~masked.meters
     pinned = indices(state.detector.pinned).tolist()
     after, known, update = full.step(
-        made, state.filter, state.static, t, m, seen, stay=bool(pinned), unknown=unknown, aged=aged
+        made, state.filter, state.static, t, m, seen, stay=bool(pinned), unknown=unknown, jump=jump
     )
     test, evidence = detector.step(
         made, core.faults, state.detector, update, known, h=h, alert=CALM * core.limit
@@ -327,19 +327,19 @@ def step(  # noqa: PLR0917  # the state, and one tick
     if update.exact is not None:
         if pinned and not suspected:
             suspected = replay.carried(made, state.detector.onsets, state.static, pinned)
-        gap = Interval(h, aged)
+        gap = Interval(h, jump)
         suspected = tuple(replay.follow(made, each, update.exact, gap) for each in suspected)
-    others = tuple(rivals.follow(each, t, m, seen, unknown, aged) for each in state.rivals)
+    others = tuple(rivals.follow(each, t, m, seen, unknown, jump) for each in state.rivals)
     if evidence.log_m >= core.limit and (not pinned or _elsewhere(evidence, pinned)):
         test = detector.pin(test, evidence.rows)
-        last = replay.record(state.history, (after, known, test, ()), m, seen, unknown, aged)
+        last = replay.record(state.history, (after, known, test, ()), m, seen, unknown, jump)
         others = rivals.replayed(made, core.rivals, last, test.onsets, int(evidence.rows[0]))
         if update.exact is not None:
             rows = np.flatnonzero(test.pinned).tolist()
             suspected = replay.replayed(made, last, test.onsets, rows)
     elif pinned and evidence.log_m < CALM * core.limit:
         test, suspected, others = detector.pin(test, evidence.rows[:0]), (), ()
-    history = replay.record(state.history, (after, known, test, suspected), m, seen, unknown, aged)
+    history = replay.record(state.history, (after, known, test, suspected), m, seen, unknown, jump)
     return CoreState(after, known, test, update, history, suspected, masked, others, beyond), evidence
 
 
@@ -403,8 +403,8 @@ def again(
     now = CoreState(before, known, test, None, kept, (), masking.none(core.modes), beyond=state.beyond)
     evidence = Evidence(-inf, np.full(test.capital.shape, -inf))
     for k in range(len(kept.readings), len(history.readings)):
-        t, m, seen, unknown, aged = history.readings[k]
-        now, evidence = step(core, now, t, m, *change(k, seen, unknown), aged)
+        t, m, seen, unknown, jump = history.readings[k]
+        now, evidence = step(core, now, t, m, *change(k, seen, unknown), jump)
     return now, evidence
 
 

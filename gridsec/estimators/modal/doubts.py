@@ -27,14 +27,13 @@ c_j^2 / 3. With the design's deviations s_j, without common parts,
 
     sum_j a_j a_j' c_j^2 / 3  <=  r S,   r = max_j c_j^2 / (3 s_j^2).
 
-The errors of all loads therefore age by the time in which an AR(1) process renews the share r of its
-variance, ``-T log(1 - r) / 2``: w keeps its covariance S, whatever the powers do.
+The variance of w gains r S in such a tick. Its mean stays: what lasts is not renewed with a power.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import log1p, sqrt
+from math import sqrt
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -54,8 +53,8 @@ UNSETTLED = 4.0
 """Ratio of an injection's error to the design's from which on the injection is unknown, 1."""
 NOTICED = 0.5
 """Change of a voltage, in white deviations, from which on a changed power counts as a load that jumps, 1."""
-RENEWED = 0.99
-"""Largest share of the loads' variance that a tick renews, 1."""
+FARTHEST = 10.0
+"""Largest variance of a jump, in that of the loads, 1: a power over three times the usual ones."""
 SKEWED = 0.5
 """Change of a voltage within a clock offset from which on the reading is unknown, in white deviations, 1."""
 
@@ -134,10 +133,8 @@ def reach(design: SequentialDesign) -> Floats:
     return np.asarray((np.abs(columns) / np.sqrt(design.white)[:, None]).max(axis=0))
 
 
-def aging(
-    design: SequentialDesign, reach: Floats, time_s: float, before: Frame | None, measured: Measurements
-) -> float:
-    """Time by which the errors of the loads age beyond the interval, since powers have changed, s.
+def jump(design: SequentialDesign, reach: Floats, before: Frame | None, measured: Measurements) -> float:
+    """Variance of a jump of the loads' errors where reported powers jump, in that of the loads, 1.
 
     The reactive error of a load that is switched on may be all of the reactive power that the model adds.
 
@@ -145,8 +142,6 @@ def aging(
     ----------
     design, reach
         The front end, and the reach of its powers.
-    time_s
-        T of the loads, s.
     before, measured
         The last frame, and the measurements of this one.
     """
@@ -166,7 +161,7 @@ def aging(
             noticed &= np.tile(origin == PowerOrigin.READ, 2)
     smooth = design.doubt.smooth
     ratio = changed[noticed] / (root * np.maximum(np.concatenate([smooth.p, smooth.q])[noticed], EXACT))
-    return -0.5 * time_s * log1p(-min(float(ratio.max(initial=0.0)) ** 2, RENEWED))
+    return min(float(ratio.max(initial=0.0)) ** 2, FARTHEST)
 
 
 def _powers(

@@ -8,9 +8,9 @@ With ``z = U' m`` of `gridsec.estimators.modal.model`, each mode has the states 
               (w, b) += k nu,  P -= v k k'
 
 where q and s are the variances of w and b, ``rho = exp(-h / T)``, ``rho_b = exp(-h / T_b)`` for an interval
-of h seconds. The errors of the loads may age by more than h (`gridsec.estimators.modal.doubts`). The cost is
-O(t) and the product ``U' m``. The filter is exact for ``B = kappa D``, and with
-`gridsec.estimators.modal.static` for every B.
+of h seconds. Where reported powers jump, the variance of w gains ``j q`` besides (`doubts`). The cost is O(t)
+and the product ``U' m``. The filter is exact for ``B = kappa D``, and with `gridsec.estimators.modal.static`
+for every B.
 
 **Missing readings** couple the modes: `gridsec.estimators.modal.full` follows the exact filter then. The
 covariance here stays that of complete readings. It is a lower bound of the exact one: ``diag(1 / v)`` is
@@ -41,16 +41,16 @@ class Interval:
     ----------
     h
         Its length, s.
-    aged
-        Time by which the errors of the loads age besides, s.
+    jump
+        Variance of a jump of the loads' errors within it, in that of the loads, 1.
     """
 
     h: float
-    aged: float = 0.0
+    jump: float = 0.0
 
     def decay(self, modes: Modes) -> tuple[float, float]:
         """Factors rho and rho_b."""
-        return exp(-(self.h + self.aged) / modes.model.time_s), exp(-self.h / modes.model.fixed_s)
+        return exp(-self.h / modes.model.time_s), exp(-self.h / modes.model.fixed_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,6 +176,8 @@ class Update:
         Its score in the modes.
     seen : (t,) or None
         Members with a reading; None: all.
+    jump
+        As in `Interval`.
     """
 
     decay: tuple[float, float]
@@ -186,6 +188,7 @@ class Update:
     exact: Innovation | None = None
     score: Floats | None = None
     seen: Bools | None = None
+    jump: float = 0.0
 
 
 def start(modes: Modes, t: float) -> FilterState:
@@ -203,7 +206,7 @@ def start(modes: Modes, t: float) -> FilterState:
 
 
 def step(  # noqa: PLR0917  # the state, and one tick
-    modes: Modes, state: FilterState, t: float, m: Floats, seen: Bools | None = None, aged: float = 0.0
+    modes: Modes, state: FilterState, t: float, m: Floats, seen: Bools | None = None, jump: float = 0.0
 ) -> tuple[FilterState, Update]:
     """Take in the residuals of one tick.
 
@@ -217,8 +220,8 @@ def step(  # noqa: PLR0917  # the state, and one tick
         Residuals of the members, squared pu; any finite value where not seen.
     seen : (t,)
         Members with a reading; None: all.
-    aged
-        Time by which the errors of the loads age besides, s.
+    jump
+        As in `Interval`.
 
     Raises
     ------
@@ -228,8 +231,8 @@ def step(  # noqa: PLR0917  # the state, and one tick
     h = t - state.t
     if not h >= 0.0:
         raise InputInvalid([Problem("order", f"t is {t}; it must not be before {state.t}")])
-    rho, rho_b = Interval(h, aged).decay(modes)
-    cov, shared, v = predicted(modes, state.cov, rho, rho_b)
+    rho, rho_b = Interval(h).decay(modes)
+    cov, shared, v = predicted(modes, state.cov, rho, rho_b, jump)
     whole = seen is None or all_of(seen)
     gain, mean, nu = shared / v, state.mean, np.zeros(v.size)
     if state.full is None:
@@ -242,10 +245,14 @@ def step(  # noqa: PLR0917  # the state, and one tick
         mean += gain * nu
     cov[:2] -= gain * shared[0]
     cov[2] -= gain[1] * shared[1]
-    return FilterState(t, mean, cov), Update((rho, rho_b), nu, v, gain, seen=None if whole else seen)
+    return FilterState(t, mean, cov), Update(
+        (rho, rho_b), nu, v, gain, seen=None if whole else seen, jump=jump
+    )
 
 
-def predicted(modes: Modes, cov: Floats, rho: float, rho_b: float) -> tuple[Floats, Floats, Floats]:
+def predicted(
+    modes: Modes, cov: Floats, rho: float, rho_b: float, jump: float = 0.0
+) -> tuple[Floats, Floats, Floats]:
     """Covariance (3, t) before a tick, that of (w, b) with the innovation (2, t), and v (t,).
 
     Parameters
@@ -254,11 +261,11 @@ def predicted(modes: Modes, cov: Floats, rho: float, rho_b: float) -> tuple[Floa
         The modes.
     cov : (3, t)
         Covariance after the last tick.
-    rho, rho_b
-        Factors of the interval.
+    rho, rho_b, jump
+        Factors and jump of the interval.
     """
     cov = cov * np.array([[rho * rho], [rho * rho_b], [rho_b * rho_b]])
-    cov[0] += (1.0 - rho * rho) * modes.varying
+    cov[0] += (1.0 - rho * rho + jump) * modes.varying
     cov[2] += (1.0 - rho_b * rho_b) * modes.lasting
     shared = cov[:2] + cov[1:]
     return cov, shared, shared[0] + shared[1] + 1.0

@@ -64,7 +64,7 @@ def step(  # noqa: PLR0917  # the states of both parts, and one tick
     *,
     stay: bool = False,
     unknown: Floats | None = None,
-    aged: float = 0.0,
+    jump: float = 0.0,
 ) -> tuple[FilterState, Static, Update]:
     """Take in the residuals of one tick by the exact filter.
 
@@ -83,8 +83,8 @@ def step(  # noqa: PLR0917  # the states of both parts, and one tick
     unknown : (t, k)
         Directions of the residuals that are unknown at this tick, times their standard deviations; None for
         none.
-    aged
-        Time by which the errors of the loads age besides the interval, s.
+    jump
+        Variance of a jump of the loads' errors, in that of the loads, 1.
 
     Raises
     ------
@@ -96,9 +96,9 @@ def step(  # noqa: PLR0917  # the states of both parts, and one tick
         state, known = _returned(modes, state, state.full, known)
     if state.full is None and not whole:
         state = replace(state, full=expanded(modes, state, known))
-    after, update = modal.step(modes, state, t, m, seen, aged)
+    after, update = modal.step(modes, state, t, m, seen, jump)
     if state.full is not None:
-        gap = Interval(t - state.t, aged)
+        gap = Interval(t - state.t, jump)
         full, innovation = updated(modes, state.full, gap, m, None if whole else seen, unknown)
         score = innovation.score @ modes.back[innovation.rows]
         share, since = _share(modes, state.full, update)
@@ -159,7 +159,7 @@ def updated(  # noqa: PLR0917  # the filter, and one tick
     mean = before.mean * np.array([[rho], [rho_b]])
     w, both, b = before.blocks
     w, both, b = w * rho**2, both * (rho * rho_b), b * rho_b**2
-    w += (1.0 - rho * rho) * modes.covariance_w
+    w += (1.0 - rho * rho + gap.jump) * modes.covariance_w
     b += (1.0 - rho_b * rho_b) * modes.covariance_b
     if not rows.size:
         none = np.zeros((2 * t, 0))
@@ -209,14 +209,14 @@ def expected(modes: Modes, before: Full, gap: Interval, rows: Ints) -> Floats:
     w, both, b = (submatrix(each, rows, rows) for each in before.blocks)
     V = rho * rho * w + rho_b * rho_b * b
     V += rho * rho_b * (both + both.T) + submatrix(modes.noise, rows, rows)
-    V += (1.0 - rho * rho) * submatrix(modes.covariance_w, rows, rows)
+    V += (1.0 - rho * rho + gap.jump) * submatrix(modes.covariance_w, rows, rows)
     V += (1.0 - rho_b * rho_b) * submatrix(modes.covariance_b, rows, rows)
     return V
 
 
 def _kept(modes: Modes, kept: Floats, update: Update, share: Floats | None) -> tuple[Floats, Floats]:
     """Diagonal covariance after one tick, (3, t), and its gain, (2, t), times the share that was read."""
-    cov, shared, v = modal.predicted(modes, kept, *update.decay)
+    cov, shared, v = modal.predicted(modes, kept, *update.decay, update.jump)
     gain = shared / v
     if share is not None:
         gain *= share
@@ -235,7 +235,7 @@ def _share(modes: Modes, before: Full, update: Update) -> tuple[Floats | None, i
         return None, 0
     if before.share is not None and before.since < SHARED and np.array_equal(before.seen, update.seen):
         return before.share, before.since + 1
-    g, v = indices(~update.seen), modal.predicted(modes, before.kept, *update.decay)[2]
+    g, v = indices(~update.seen), modal.predicted(modes, before.kept, *update.decay, update.jump)[2]
     if g.size == modes.size:
         return np.zeros(modes.size), 0
     half, _ = lapack.dpotrf((modes.U[g] / v) @ modes.U[g].T, lower=True, clean=True)

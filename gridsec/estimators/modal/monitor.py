@@ -291,7 +291,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
         m,
         None if whole else seen,
         None if open_ is None else open_.wide,
-        doubts.aging(front, design.reach, design.core.model.time_s, given.frame, measured),
+        doubts.jump(front, design.reach, given.frame, measured),
     )
     after, evidence = _identified(design, changed(state, front=now, core=kernel), evidence, measured.uses_q)
     if after.front.busbar is not now.busbar:

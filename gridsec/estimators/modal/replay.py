@@ -36,7 +36,7 @@ NEAR = 16
 """Ticks from one to the next of the two youngest kept states: most onsets are named within so many ticks."""
 
 Reading = tuple[float, Floats, Bools | None, Floats | None, float]
-"""Time, residuals (t,), members with a reading (t,), unknown directions (t, k), and aging of the loads, s."""
+"""Time, residuals (t,), members with a reading (t,), unknown directions (t, k), and jump of the loads."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +108,7 @@ def record(  # noqa: PLR0917  # the state, and one tick
     m: Floats,
     seen: Bools | None,
     unknown: Floats | None = None,
-    aged: float = 0.0,
+    jump: float = 0.0,
 ) -> History:
     """Keep the readings of one tick.
 
@@ -122,10 +122,10 @@ def record(  # noqa: PLR0917  # the state, and one tick
         Residuals, and members with a reading.
     unknown : (t, k)
         Unknown directions.
-    aged
-        Time by which the errors of the loads age besides the interval, s.
+    jump
+        As in `gridsec.estimators.modal.filter.Interval`.
     """
-    readings, recent = (*history.readings, (after[0].t, m, seen, unknown, aged)), history.recent
+    readings, recent = (*history.readings, (after[0].t, m, seen, unknown, jump)), history.recent
     count, middle = len(readings), history.middle
     if count % NEAR == 0:
         recent = (*recent[-1:], (count, after))
@@ -150,8 +150,8 @@ def replayed(modes: Modes, history: History, onsets: Onsets, rows: Sequence[int]
     count, (state, known, *_) = len(history.readings), history.start
     t, full = state.t, exact.expanded(modes, state, known) if state.full is None else state.full
     out = {row: begun(modes, row, bool(onsets.ramp[row])) for row in rows}
-    for k, (now, m, seen, unknown, aged) in enumerate(history.readings):
-        gap = Interval(now - t, aged)
+    for k, (now, m, seen, unknown, jump) in enumerate(history.readings):
+        gap = Interval(now - t, jump)
         full, innovation = exact.updated(modes, full, gap, m, seen, unknown)
         for row in rows:
             if onsets.age[row] >= count - k:

@@ -163,8 +163,8 @@ def replayed(
     if older and (state.full is None or exactly is not None):
         begin, one = -1, signatures.single(had, row)
     out = [replace(each, onsets=one, suspected=exactly) for each in first(modes, others, history)]
-    for k, (t, m, seen, unknown, aged) in enumerate(history.readings):
-        out = [follow(each, t, m, seen, unknown, aged, begun=k == begin) for each in out]
+    for k, (t, m, seen, unknown, jump) in enumerate(history.readings):
+        out = [follow(each, t, m, seen, unknown, jump, begun=k == begin) for each in out]
     return tuple(out)
 
 
@@ -174,7 +174,7 @@ def follow(  # noqa: PLR0917  # the state, and one tick
     m: Floats,
     seen: Bools | None,
     unknown: Floats | None = None,
-    aged: float = 0.0,
+    jump: float = 0.0,
     *,
     begun: bool = False,
 ) -> Rival:
@@ -190,12 +190,12 @@ def follow(  # noqa: PLR0917  # the state, and one tick
         Residuals, and members with a reading; None: all.
     unknown : (p, k)
         Unknown directions, as in `gridsec.estimators.modal.full.step`.
-    aged
-        Time by which the errors of the loads age besides the interval, s.
+    jump
+        As in `gridsec.estimators.modal.filter.Interval`.
     begun
         The onset is at this tick.
     """
-    modes, state, known, gap = before.modes, before.filter, before.static, Interval(t - before.filter.t, aged)
+    modes, state, known, gap = before.modes, before.filter, before.static, Interval(t - before.filter.t, jump)
     total, onsets, suspected, jumps = before.sum, before.onsets, before.suspected, before.jumps
     if state.full is None and not ((seen is None or all_of(seen)) and unknown is None):
         total += _of_theta(modes, known) - before.known
@@ -207,7 +207,7 @@ def follow(  # noqa: PLR0917  # the state, and one tick
         size, prior = _jump(modes, state, known, gap, m, seen, unknown)
         total, jumps = total + prior, jumps + (size > 0.0)
         state = _jumped(modes, state, gap, size)
-    state, known, update = exact.step(modes, state, known, t, m, seen, stay=True, unknown=unknown, aged=aged)
+    state, known, update = exact.step(modes, state, known, t, m, seen, stay=True, unknown=unknown, jump=jump)
     if update.exact is None:
         total -= 0.5 * float((update.innovation**2 / update.variance + np.log(update.variance)).sum())
         if begun or onsets.used[0]:
@@ -220,7 +220,7 @@ def follow(  # noqa: PLR0917  # the state, and one tick
         if suspected is not None:
             suspected = replay.follow(modes, suspected, update.exact, gap)
     rho2 = gap.decay(modes)[0] ** 2
-    loads = rho2 * before.loads + (1.0 - rho2) * before.unrest + size
+    loads = rho2 * before.loads + (1.0 - rho2) * before.unrest + size + jump
     return replace(
         before,
         filter=state,
@@ -260,7 +260,7 @@ def _jump(  # noqa: PLR0917  # the states of both parts, and one tick
         [log(1.0 - len(JUMPS) * RATE), *[log(RATE)] * len(JUMPS)],
     )
     if state.full is None:
-        _, _, v = modal.predicted(modes, state.cov, rho, rho_b)
+        _, _, v = modal.predicted(modes, state.cov, rho, rho_b, gap.jump)
         g = known.signature
         nu = m @ modes.U - rho * state.mean[0] - rho_b * state.mean[1]
         if modes.sign.size:

@@ -23,7 +23,7 @@ from feeders.registry import MODAL, choose, design
 from gridsec.estimators.modal import doubts
 from gridsec.estimators.modal.doubts import Unknown, unknown
 from gridsec.estimators.modal.monitor import ModalDesign, init
-from gridsec.estimators.sequential.design import SequentialOptions
+from gridsec.estimators.sequential.design import SequentialDesign, SequentialOptions
 from gridsec.estimators.sequential.measurements import measurements, update_uncertainty
 from gridsec.estimators.sequential.step import predict
 from gridsec.interface import PowerOrigin
@@ -186,11 +186,11 @@ def test_loads_that_jump_are_no_evidence_for_modal(seed: int) -> None:
     assert of_bound <= 1.0
 
 
-def test_loads_age_where_their_reported_powers_jump(site: Site) -> None:
-    """By the time that renews the share of their variance; not where a power is missing, back or metered."""
+def test_loads_jump_with_their_reported_powers(site: Site) -> None:
+    """By the largest ratio of variances of a power; not where one is missing, is back, or is metered."""
     made = design(choose(site, estimator=MODAL)).design
     assert isinstance(made, ModalDesign)
-    front, state, time_s = made.front, init(made, T).front, made.core.model.time_s
+    front, state = made.front, init(made, T).front
     j, root = int(made.reach[site.meters + front.customers].argmax()), np.sqrt(3.0)
     silent = np.full(site.meters.size, np.nan)
 
@@ -199,25 +199,25 @@ def test_loads_age_where_their_reported_powers_jump(site: Site) -> None:
         p[j], q[j] = kw, reported
         return replace(said(site), p_kw=p, q_kvar=q)
 
-    def aged(before: Snapshot, now: Snapshot, factor: float = 10.0) -> float:
+    def jump(before: Snapshot, now: Snapshot, factor: float = 10.0, of: SequentialDesign = front) -> float:
         known, frame = state.trust.trusted, to_frame(site, now)
         measured = measurements(front, frame, known, state.busbar.trusted, state.v0_squared)
-        return doubts.aging(front, factor * made.reach, time_s, to_frame(site, before), measured)
+        return doubts.jump(of, factor * made.reach, to_frame(site, before), measured)
 
     one, other, at = to_frame(site, reading(1.0)), to_frame(site, reading(4.0)), site.meters[j]
     c = abs(one.q[at] - other.q[at]) + abs(one.q_error[at] - other.q_error[at])
     share = (c / root / front.doubt.q[at]) ** 2
-    assert 0.0 < share < doubts.RENEWED
-    assert aged(reading(1.0), reading(4.0)) == pytest.approx(-0.5 * time_s * np.log(1.0 - share))
-    assert aged(reading(4.0), reading(1.0)) == aged(reading(1.0), reading(4.0))
+    assert 0.0 < share < 1.0
+    assert jump(reading(1.0), reading(4.0)) == pytest.approx(share)
+    assert jump(reading(4.0), reading(1.0)) == jump(reading(1.0), reading(4.0))
     # No meter would see it.
-    assert aged(reading(1.0), reading(4.0), 1.0) == 0.0
-    most = -0.5 * time_s * np.log(1.0 - doubts.RENEWED)
-    assert aged(reading(0.0), reading(site.tables.customers[at].load_kw)) == pytest.approx(most)
-    assert aged(reading(np.nan), reading(4.0)) == aged(reading(1.0), reading(np.nan)) == 0.0
-    assert aged(reading(1.0), reading(4.0, reported=0.3)) < aged(reading(1.0), reading(4.0))
+    assert jump(reading(1.0), reading(4.0), 1.0) == 0.0
+    sure = replace(front.doubt, q=front.doubt.q / 100.0)
+    assert jump(reading(1.0), reading(4.0), of=replace(front, doubt=sure)) == doubts.FARTHEST
+    assert jump(reading(np.nan), reading(4.0)) == jump(reading(1.0), reading(np.nan)) == 0.0
+    assert jump(reading(1.0), reading(4.0, reported=0.3)) < jump(reading(1.0), reading(4.0))
     frame = measurements(front, one, state.trust.trusted, state.busbar.trusted, state.v0_squared)
-    assert doubts.aging(front, made.reach, time_s, None, frame) == 0.0
+    assert doubts.jump(front, made.reach, None, frame) == 0.0
 
 
 def test_an_unchanged_power_has_the_age_of_its_first_reading(site: Site) -> None:

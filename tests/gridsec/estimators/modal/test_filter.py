@@ -65,18 +65,18 @@ def test_equals_the_dense_filter_where_b_is_proportional(fixed_s: float) -> None
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3])
-def test_loads_that_age_faster_are_those_of_the_dense_filter(share: float) -> None:
-    """The errors of the loads age by up to four time constants in a tick; also with missing readings."""
+def test_loads_that_jump_are_those_of_the_dense_filter(share: float) -> None:
+    """The variance of the loads' errors gains up to three times its prior; also with missing readings."""
     model, random = mixed(), np.random.default_rng(4)
     made = modes(model)
     state, more, dense = modal.start(made, 0.0), static.start(made), Dense(model)
     for k in range(60):
-        aged, seen = float(random.choice([0.0, 100.0, 2400.0])), random.random(made.size) >= share
+        jump, seen = float(random.choice([0.0, 0.1, 3.0])), random.random(made.size) >= share
         m = 0.01 * random.standard_normal(made.size)
         state, more, update = full.step(
-            made, state, more, float(k), m, None if seen.all() else seen, aged=aged
+            made, state, more, float(k), m, None if seen.all() else seen, jump=jump
         )
-        nu, V = dense.step(float(k > 0), m, seen, aged=aged)
+        nu, V = dense.step(float(k > 0), m, seen, jump=jump)
         if update.exact is not None:
             assert close(update.exact.half @ update.exact.white, nu)
             assert close(update.exact.half @ update.exact.half.T, V)

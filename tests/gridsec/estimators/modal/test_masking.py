@@ -84,8 +84,8 @@ def test_a_replay_from_a_late_state_equals_one_from_the_first(kernel: Core, shar
     state = core.init(kernel, 0.0)
     for k in range(ticks):
         seen = random.random(12) >= share
-        aged = 300.0 * (k % 50 == 20)
-        state, evidence = core.step(kernel, state, float(k), source.tick() + lie(k), seen, None, aged)
+        jump = 0.5 * (k % 50 == 20)
+        state, evidence = core.step(kernel, state, float(k), source.tick() + lie(k), seen, None, jump)
     suspicion = core.identify(kernel, state, evidence)
     assert suspicion.found.named.any()
     whole = replace(state.history, middle=None, recent=())
