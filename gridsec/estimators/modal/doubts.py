@@ -27,7 +27,8 @@ c_j^2 / 3. With the design's deviations s_j, without common parts,
 
     sum_j a_j a_j' c_j^2 / 3  <=  r S,   r = max_j c_j^2 / (3 s_j^2).
 
-The variance of w gains r S in such a tick. Its mean stays: what lasts is not renewed with a power.
+The variance of w gains r S in such a tick. Its mean stays: what lasts is not renewed with a power. Over
+intervals longer than `SUDDEN_S` all powers change, and w as its model has it.
 """
 
 from __future__ import annotations
@@ -53,6 +54,8 @@ UNSETTLED = 4.0
 """Ratio of an injection's error to the design's from which on the injection is unknown, 1."""
 NOTICED = 0.5
 """Change of a voltage, in white deviations, from which on a changed power counts as a load that jumps, 1."""
+SUDDEN_S = 60.0
+"""Longest interval in which powers jump, s. Over longer ones loads change as the AR(1) has it."""
 FARTHEST = 10.0
 """Largest variance of a jump, in that of the loads, 1: a power over three times the usual ones."""
 SKEWED = 0.5
@@ -145,9 +148,9 @@ def jump(design: SequentialDesign, reach: Floats, before: Frame | None, measured
     before, measured
         The last frame, and the measurements of this one.
     """
-    if before is None:
-        return 0.0
     frame, N, root = measured.frame, design.customers, sqrt(3.0)
+    if before is None or frame.t - before.t > SUDDEN_S:
+        return 0.0
     changed = np.empty(2 * N)
     np.abs(frame.p_error - before.p_error, out=changed[:N])
     np.add(np.abs(frame.q_error - before.q_error), np.abs(frame.q - before.q), out=changed[N:])

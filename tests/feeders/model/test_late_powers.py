@@ -218,6 +218,8 @@ def test_loads_jump_with_their_reported_powers(site: Site) -> None:
     assert jump(reading(1.0), reading(4.0, reported=0.3)) < jump(reading(1.0), reading(4.0))
     frame = measurements(front, one, state.trust.trusted, state.busbar.trusted, state.v0_squared)
     assert doubts.jump(front, made.reach, None, frame) == 0.0
+    later = replace(reading(4.0), t=T + doubts.SUDDEN_S + 1.0)
+    assert jump(reading(1.0), later) == 0.0
 
 
 def test_an_unchanged_power_has_the_age_of_its_first_reading(site: Site) -> None:
