@@ -152,7 +152,7 @@ def ages(seed: int, how: str, ticks: int, count: int) -> Floats:
     return np.full((ticks, count), LATE_S if how == "late" else 0.0)
 
 
-def run(  # one run, and the monitor
+def run(
     seed: int, duration_s: int, how: str, stated: str, estimator: str = SEQUENTIAL
 ) -> tuple[Counter[str], float, float]:
     """Counts of one run, and its largest error over the standard deviation and over the bound.
@@ -201,7 +201,7 @@ def run(  # one run, and the monitor
     return seen, of_std, of_bound
 
 
-def unchanged(  # one run, and the monitor
+def unchanged(
     seed: int, duration_s: int, kind: str, count: int, estimator: str = SEQUENTIAL
 ) -> tuple[Counter[str], float, float]:
     """Counts of a run with unchanged powers; its largest error over the standard deviation and the bound.

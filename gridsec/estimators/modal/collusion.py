@@ -19,8 +19,8 @@ with the most of C, but not all, splits it. Both parts are checked by themselves
 
 **False powers.** A coalition of customers that also report false powers can imitate a false power elsewhere
 beside an honest meter. Where J has faults that are no meters, customers with a false reading and a false
-power each, without a charge, are looked for in place of C and of these faults: the customer that lowers L
-most is added until none lowers it.
+power each, without a charge, are looked for in place of C and of these faults, the busbar and inverters
+included. The customer with possible amounts that lowers L most is added until none lowers it.
 
 **Search of g.** Given the amounts of the rest J - C, g has the information F and the scores y. One amount x
 has the relaxation
@@ -164,18 +164,20 @@ def _customers(
     charge[near.powers] = 0.0
     free, chosen = replace(problem, charge=charge), _without(J, accused)
     chosen[p:] = False
-    least, usable = float(_evidence(free, chosen[None])[0]), informed(problem) & ~accused & ~masked
+    # The powers of masked customers are free, too.
+    least, usable = float(_evidence(free, chosen[None])[0]), (informed(problem) | masked) & ~accused
     while True:
         added = np.flatnonzero(usable & ~chosen[near.powers])
         sets = np.repeat(chosen[None], added.size, axis=0)
         sets[np.arange(added.size), added] = sets[np.arange(added.size), near.powers[added]] = True
         sets = sets[np.count_nonzero(sets[:, :p] | masked, axis=1) <= max(near.most, p // 3)]
         each = _evidence(free, sets) if len(sets) else np.zeros(0)
-        if not each.size or not each.min() < least - GAIN:
+        order = [k for k in np.argsort(each, kind="stable").tolist() if each[k] < least - GAIN]
+        possible = (k for k in order if not any_of(np.abs(mean_amounts(free, sets[k])) > free.bound[sets[k]]))
+        best = next(possible, None)
+        if best is None:
             return
-        chosen, least = sets[int(each.argmin())], float(each.min())
-        if any_of(np.abs(mean_amounts(free, chosen)) > free.bound[chosen]):
-            return
+        chosen, least = sets[best], float(each[best])
         yield least, chosen
 
 

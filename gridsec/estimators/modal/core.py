@@ -141,6 +141,8 @@ class CoreState:
         The model and its rivals since the start of the kept readings, with the likeliest pinned onset.
     beyond : (p,)
         Meters with an own error beyond their accuracy class when they were compared last.
+    loads
+        Variance of the loads' errors, in that of the model, 1: more after a jump.
     """
 
     filter: FilterState
@@ -152,6 +154,7 @@ class CoreState:
     masked: Masked
     rivals: tuple[Rival, ...] = ()
     beyond: Bools | None = None
+    loads: float = 1.0
 
     @property
     def exceeding(self) -> Bools:
@@ -340,7 +343,9 @@ def step(  # noqa: PLR0917  # the state, and one tick
     elif pinned and evidence.log_m < CALM * core.limit:
         test, suspected, others = detector.pin(test, evidence.rows[:0]), (), ()
     history = replay.record(state.history, (after, known, test, suspected), m, seen, unknown, jump)
-    return CoreState(after, known, test, update, history, suspected, masked, others, beyond), evidence
+    rho2 = update.decay[0] ** 2
+    loads = rho2 * state.loads + (1.0 - rho2) + jump
+    return CoreState(after, known, test, update, history, suspected, masked, others, beyond, loads), evidence
 
 
 def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState, Evidence]:
@@ -400,7 +405,9 @@ def again(
         before, test = begun or before, detector.start(core.modes)
         kept = History((before, known, test, ()))
     test = detector.pin(test, np.zeros(0, np.intp))
-    now = CoreState(before, known, test, None, kept, (), masking.none(core.modes), beyond=state.beyond)
+    now = CoreState(
+        before, known, test, None, kept, (), masking.none(core.modes), (), state.beyond, state.loads
+    )
     evidence = Evidence(-inf, np.full(test.capital.shape, -inf))
     for k in range(len(kept.readings), len(history.readings)):
         t, m, seen, unknown, jump = history.readings[k]
@@ -619,7 +626,7 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     if state.update is None:
         raise InputInvalid([Problem("missing", "no reading is available yet")])
     made, by = core.modes, core.estimator
-    plain = estimates.honest(made, by, state.filter, state.static)
+    plain = estimates.honest(made, by, state.filter, state.static, loads=state.loads)
     if suspicion is None:
         return plain
     found, T = suspicion.found, list[Floats]()

@@ -210,11 +210,11 @@ def step(
 ) -> tuple[Detector, Evidence]:
     """Take in one step of the filter and evaluate M, if that is due.
 
-    All onsets are evaluated at the first `EVERY` ticks, and then at every `EVERY`-th: no verdict after a
-    start rests on nothing. Young and pinned ones are evaluated at every tick while an onset is pinned, while
-    log M was above `alert`, where a reading is missing, and where one innovation stands out by itself. Powers
-    are evaluated with all onsets and while one is pinned: an alarm by them alone lasts. The choice may depend
-    on the readings: what is left out only makes M smaller.
+    All onsets are evaluated at the first `EVERY` ticks, and then at every `EVERY`-th. Young and pinned ones
+    are evaluated at every tick while an onset is pinned, while log M was above `alert`, where a reading is
+    missing, and where one innovation stands out by itself. Powers are evaluated with all onsets and while
+    one is pinned: an alarm by them alone lasts. The choice may depend on the readings: what is left out only
+    makes M smaller.
 
     Parameters
     ----------

@@ -27,8 +27,9 @@ c_j^2 / 3. With the design's deviations s_j, without common parts,
 
     sum_j a_j a_j' c_j^2 / 3  <=  r S,   r = max_j c_j^2 / (3 s_j^2).
 
-The variance of w gains r S in such a tick. Its mean stays: what lasts is not renewed with a power. Over
-intervals longer than `SUDDEN_S` all powers change, and w as its model has it.
+The variance of w gains r S in such a tick. Changes below `NOTICED` do not count, and r is at most `FARTHEST`.
+The mean of w stays: what lasts is not renewed with a power. Over intervals longer than `SUDDEN_S` all powers
+change, and w as its model has it.
 """
 
 from __future__ import annotations
@@ -148,9 +149,9 @@ def jump(design: SequentialDesign, reach: Floats, before: Frame | None, measured
     before, measured
         The last frame, and the measurements of this one.
     """
-    frame, N, root = measured.frame, design.customers, sqrt(3.0)
-    if before is None or frame.t - before.t > SUDDEN_S:
+    if before is None or measured.frame.t - before.t > SUDDEN_S:
         return 0.0
+    frame, before, N, root = usual(measured.frame), usual(before), design.customers, sqrt(3.0)
     changed = np.empty(2 * N)
     np.abs(frame.p_error - before.p_error, out=changed[:N])
     np.add(np.abs(frame.q_error - before.q_error), np.abs(frame.q - before.q), out=changed[N:])
@@ -160,10 +161,17 @@ def jump(design: SequentialDesign, reach: Floats, before: Frame | None, measured
     noticed[N:] &= ~measured.uses_q
     for origin in (frame.p_origin, before.p_origin):
         if origin is not None:
-            # Powers that are back, or that are missing now, have not jumped.
+            # Missing powers, and those that come back, are compared with no other frame.
             noticed &= np.tile(origin == PowerOrigin.READ, 2)
-    smooth = design.doubt.smooth
-    ratio = changed[noticed] / (root * np.maximum(np.concatenate([smooth.p, smooth.q])[noticed], EXACT))
+    doubt = design.doubt
+    if doubt.sudden_p is not None:
+        # Unknown directions of every frame.
+        noticed &= np.tile(doubt.sudden_p == 0.0, 2)
+    alone = np.sqrt(1.0 - np.broadcast_to(doubt.together, N))
+    own = np.concatenate(
+        [np.sqrt(1.0 - doubt.common_p) * alone * doubt.p, np.sqrt(1.0 - doubt.common_q) * alone * doubt.q]
+    )
+    ratio = changed[noticed] / (root * np.maximum(own[noticed], EXACT))
     return min(float(ratio.max(initial=0.0)) ** 2, FARTHEST)
 
 

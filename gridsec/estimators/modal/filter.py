@@ -8,9 +8,9 @@ With ``z = U' m`` of `gridsec.estimators.modal.model`, each mode has the states 
               (w, b) += k nu,  P -= v k k'
 
 where q and s are the variances of w and b, ``rho = exp(-h / T)``, ``rho_b = exp(-h / T_b)`` for an interval
-of h seconds. Where reported powers jump, the variance of w gains ``j q`` besides (`doubts`). The cost is O(t)
-and the product ``U' m``. The filter is exact for ``B = kappa D``, and with `gridsec.estimators.modal.static`
-for every B.
+of h seconds. Where reported powers jump, the variance of w gains ``j lam`` besides (`doubts`). The cost is
+O(t) and the product ``U' m``. The filter is exact for ``B = kappa D``, and with
+`gridsec.estimators.modal.static` for every B.
 
 **Missing readings** couple the modes: `gridsec.estimators.modal.full` follows the exact filter then. The
 covariance here stays that of complete readings. It is a lower bound of the exact one: ``diag(1 / v)`` is
@@ -265,7 +265,9 @@ def predicted(
         Factors and jump of the interval.
     """
     cov = cov * np.array([[rho * rho], [rho * rho_b], [rho_b * rho_b]])
-    cov[0] += (1.0 - rho * rho + jump) * modes.varying
+    cov[0] += (1.0 - rho * rho) * modes.varying
+    if jump:
+        cov[0] += jump * modes.loads
     cov[2] += (1.0 - rho_b * rho_b) * modes.lasting
     shared = cov[:2] + cov[1:]
     return cov, shared, shared[0] + shared[1] + 1.0

@@ -159,7 +159,9 @@ def updated(  # noqa: PLR0917  # the filter, and one tick
     mean = before.mean * np.array([[rho], [rho_b]])
     w, both, b = before.blocks
     w, both, b = w * rho**2, both * (rho * rho_b), b * rho_b**2
-    w += (1.0 - rho * rho + gap.jump) * modes.covariance_w
+    w += (1.0 - rho * rho) * modes.covariance_w
+    if gap.jump:
+        w += gap.jump * modes.jumps
     b += (1.0 - rho_b * rho_b) * modes.covariance_b
     if not rows.size:
         none = np.zeros((2 * t, 0))
@@ -209,7 +211,9 @@ def expected(modes: Modes, before: Full, gap: Interval, rows: Ints) -> Floats:
     w, both, b = (submatrix(each, rows, rows) for each in before.blocks)
     V = rho * rho * w + rho_b * rho_b * b
     V += rho * rho_b * (both + both.T) + submatrix(modes.noise, rows, rows)
-    V += (1.0 - rho * rho + gap.jump) * submatrix(modes.covariance_w, rows, rows)
+    V += (1.0 - rho * rho) * submatrix(modes.covariance_w, rows, rows)
+    if gap.jump:
+        V += gap.jump * submatrix(modes.jumps, rows, rows)
     V += (1.0 - rho_b * rho_b) * submatrix(modes.covariance_b, rows, rows)
     return V
 

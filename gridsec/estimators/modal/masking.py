@@ -7,7 +7,8 @@ the posterior of its fixed error, so that the reading r of a masked meter is com
 
 with P the variance of w + b, which changes slowly, and d the white variance. A meter is released after n
 readings in turn within `OUTLIER` standard deviations, if their mean is within `AGREES` of its own. n is at
-least `RELEASE`, and ``d <= n P``: more readings would hardly sharpen the comparison. It is at most `MOST`.
+least `RELEASE`, and ``d <= n P``: more readings would hardly sharpen the comparison. After `MOST` readings
+the mean decides at the latest, and the count begins anew.
 A lie that passes is smaller than that. After the release it is subject to the detector as any other.
 """
 

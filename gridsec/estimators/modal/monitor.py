@@ -607,7 +607,7 @@ def _injection_error(
 
 def _settled(design: ModalDesign, predicted: Prediction) -> bool:
     """The observer's initial transient is a small part of the error at which a reading stands out."""
-    seen = design.front.allowed + JUMP * design.core.modes.noise_std
+    seen = np.maximum(design.front.allowed, JUMP * design.core.modes.noise_std)
     return all_of(predicted.transient <= design.options.settled * seen)
 
 

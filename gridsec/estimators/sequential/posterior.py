@@ -636,6 +636,13 @@ class LoadDoubt:
             for name in ("p", "q", "sudden_p", "sudden_q")
             if not _sizes(getattr(self, name))
         ]
+        if (self.sudden_p is None) != (self.sudden_q is None):
+            problems.append(Problem("missing", "sudden_p and sudden_q belong together"))
+        problems += [
+            Problem("out-of-range", f"sudden_{name} must have the shape of {name}, and be at most {name}")
+            for name, part, whole in (("p", self.sudden_p, self.p), ("q", self.sudden_q, self.q))
+            if part is not None and (part.shape != whole.shape or (part > whole).any())
+        ]
         if not 0 < self.time_s <= LONGEST_S:
             most = f"at most {LONGEST_S:g}; what never changes is `lasting`"
             problems.append(

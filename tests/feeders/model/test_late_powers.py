@@ -206,7 +206,7 @@ def test_loads_jump_with_their_reported_powers(site: Site) -> None:
 
     one, other, at = to_frame(site, reading(1.0)), to_frame(site, reading(4.0)), site.meters[j]
     c = abs(one.q[at] - other.q[at]) + abs(one.q_error[at] - other.q_error[at])
-    share = (c / root / front.doubt.q[at]) ** 2
+    share = (c / root / front.doubt.q[at]) ** 2 / (1.0 - front.doubt.common_q)
     assert 0.0 < share < 1.0
     assert jump(reading(1.0), reading(4.0)) == pytest.approx(share)
     assert jump(reading(4.0), reading(1.0)) == jump(reading(1.0), reading(4.0))
@@ -220,6 +220,9 @@ def test_loads_jump_with_their_reported_powers(site: Site) -> None:
     assert doubts.jump(front, made.reach, None, frame) == 0.0
     later = replace(reading(4.0), t=T + doubts.SUDDEN_S + 1.0)
     assert jump(reading(1.0), later) == 0.0
+    # Powers of a stated age are unknown directions of every frame already.
+    stale = replace(front.doubt, sudden_p=0.5 * front.doubt.p, sudden_q=0.5 * front.doubt.q)
+    assert jump(reading(1.0), reading(4.0), of=replace(front, doubt=stale)) == 0.0
 
 
 def test_an_unchanged_power_has_the_age_of_its_first_reading(site: Site) -> None:

@@ -223,8 +223,8 @@ def test_customers_with_false_powers_contest_an_honest_meter() -> None:
     assert (contested(shown, NONE, 4, powers=True) == some(4)).all()
     out = collusion.weighed(shown, NONE, near(4, powers=True))
     assert (out.chosen[1] == np.append(some(1), some(1))).all()
-    # A masked meter is not named again, and its customer replaces nothing.
-    assert not contested(shown, some(1), 4, powers=True).any()
+    # The customer's meter is masked already, and its power is free.
+    assert (contested(shown, some(1), 4, powers=True) == some(4)).all()
 
 
 def test_customers_are_added_while_the_evidence_grows() -> None:
@@ -238,7 +238,12 @@ def test_customers_are_added_while_the_evidence_grows() -> None:
     assert np.isclose(found[0][0], collusion._evidence(free, np.stack(every)).min())
     assert np.isclose(found[1][0], collusion._evidence(free, found[1][1][None])[0])
     assert found[1][0] < found[0][0]
-    bounded = replace(given, bound=np.append(given.bound[:METERS], np.full(METERS, 0.1)))
+    bounded = replace(given, bound=np.append(given.bound[:METERS], np.full(METERS, 1e-6)))
+    # A better customer with an impossible power ends no search.
+    first = found[0][1]
+    given.bound[METERS:][first[METERS:]] = 0.01
+    other = next(collusion._customers(given, J, some(4), NONE, near(2, powers=True)))
+    assert not (other[1] & first).any()
     assert not list(collusion._customers(bounded, J, some(4), NONE, near(2, powers=True)))
     only = np.append(some(4), NONE)
     assert not list(collusion._customers(given, only, some(4), NONE, near(2, powers=True)))

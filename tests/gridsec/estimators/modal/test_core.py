@@ -141,3 +141,15 @@ def test_a_suspected_onset_is_kept_and_given_up() -> None:
     assert state.detector.pinned.any()
     assert abs(int(state.detector.onsets.age[suspicion.row]) - 100) <= 1
     assert np.flatnonzero(suspicion.found.named).tolist() == [LIAR]
+
+
+def test_jumps_at_every_tick_are_no_evidence() -> None:
+    """The loads are smooth, and the filter supposes a jump of their whole variance at every tick."""
+    kernel = core.assemble(MODEL, np.zeros((13, 12)), np.full(12, 0.1), gamma=1e3)
+    source, state = Source(MODEL, np.random.default_rng(5)), core.init(kernel, 0.0)
+    for k in range(1200):
+        state, evidence = core.step(kernel, state, float(k), source.tick(), None, None, 1.0)
+        assert not core.alarmed(kernel, evidence)
+    assert state.loads > 10.0
+    jumped = core.estimate(kernel, state).variance
+    assert (jumped >= core.estimate(kernel, replace(state, loads=1.0)).variance).all()
