@@ -169,7 +169,8 @@ def test_kettles_and_cars_accuse_no_meter_once_the_age_is_stated(stated: str) ->
             assert seen["clean"] == seen["ticks"]
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.acceptance)])
+@pytest.mark.canary("0")
+@pytest.mark.parametrize("seed", [0, 1])
 def test_kettles_and_cars_are_no_evidence_for_modal_once_the_age_is_stated(seed: int) -> None:
     """Loads that change by up to 11 kW within a tick; then a third of the meters is off by 3 %."""
     seen, _, of_bound = run(seed, 300, "late", "p_interval_s", MODAL)
@@ -178,7 +179,8 @@ def test_kettles_and_cars_are_no_evidence_for_modal_once_the_age_is_stated(seed:
     assert of_bound <= 1.0
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(0, marks=pytest.mark.acceptance)])
+@pytest.mark.canary("1")
+@pytest.mark.parametrize("seed", [0, 1])
 def test_loads_that_jump_are_no_evidence_for_modal(seed: int) -> None:
     """Powers of the moment: a car of 11 kW takes less reactive power than the model adds for it."""
     seen, _, of_bound = run(seed, 240, "fresh", "", MODAL)
