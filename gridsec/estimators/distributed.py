@@ -287,9 +287,7 @@ class _Design:
         self.above = [None] + [int(area[bus]) for bus in self.attach[1:]]
         alone, together = np.sqrt(1.0 - doubt.together), np.sqrt(doubt.together)
         p, q = np.maximum(doubt.p, EXACT), np.maximum(doubt.q, EXACT)
-        self.own = np.stack(
-            [np.sqrt(1.0 - doubt.common_p) * alone * p, np.sqrt(1.0 - doubt.common_q) * alone * q]
-        )
+        self.own = doubt.own
         none = np.zeros_like(p)
         common = np.stack(
             [

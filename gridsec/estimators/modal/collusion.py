@@ -107,7 +107,8 @@ def weighed(found: Identification, masked: Bools, near: Neighbourhoods) -> Ident
             continue
         own, without = _own(problem, J, accused, sign)
         sets = _instead(problem, J, amount, accused, masked, most)
-        each, other = min(chain(sets, _customers(problem, J, accused, masked, near)), key=lambda one: one[0])
+        others = _customers(problem, _without(J, accused), accused, masked, most, near.powers)
+        each, other = min(chain(sets, others), key=lambda one: one[0])
         more = max(0.0, each - own)
         if more < max(least, MISFIT * (without - own)):
             contested |= accused & named
@@ -154,23 +155,22 @@ def _instead(  # noqa: PLR0917  # one explanation
     yield from zip(_evidence(problem, np.stack(kept)).tolist(), kept, strict=True)
 
 
-def _customers(
-    problem: SearchProblem, J: Bools, accused: Bools, masked: Bools, near: Neighbourhoods
+def _customers(  # noqa: PLR0917  # one explanation
+    problem: SearchProblem, rest: Bools, accused: Bools, masked: Bools, most: int, powers: Ints
 ) -> Iterator[tuple[float, Bools]]:
     """L of customers with false readings and powers in place of meters accused, (p,), and the sets (q,)."""
     p, charge = problem.meters, problem.charge.copy()
-    if not any_of(J[p:]):
+    if not any_of(rest[p:]):
         return
-    charge[near.powers] = 0.0
-    free, chosen = replace(problem, charge=charge), _without(J, accused)
-    chosen[p:] = False
+    charge[powers] = 0.0
+    free, chosen = replace(problem, charge=charge), rest & (np.arange(rest.size) < p)
     # The powers of masked customers are free, too.
     least, usable = float(_evidence(free, chosen[None])[0]), (informed(problem) | masked) & ~accused
     while True:
-        added = np.flatnonzero(usable & ~chosen[near.powers])
+        added = np.flatnonzero(usable & ~chosen[powers])
         sets = np.repeat(chosen[None], added.size, axis=0)
-        sets[np.arange(added.size), added] = sets[np.arange(added.size), near.powers[added]] = True
-        sets = sets[np.count_nonzero(sets[:, :p] | masked, axis=1) <= max(near.most, p // 3)]
+        sets[np.arange(added.size), added] = sets[np.arange(added.size), powers[added]] = True
+        sets = sets[np.count_nonzero(sets[:, :p] | masked, axis=1) <= most]
         each = _evidence(free, sets) if len(sets) else np.zeros(0)
         order = [k for k in np.argsort(each, kind="stable").tolist() if each[k] < least - GAIN]
         possible = (k for k in order if not any_of(np.abs(mean_amounts(free, sets[k])) > free.bound[sets[k]]))

@@ -167,11 +167,7 @@ def jump(design: SequentialDesign, reach: Floats, before: Frame | None, measured
     if doubt.sudden_p is not None:
         # Unknown directions of every frame.
         noticed &= np.tile(doubt.sudden_p == 0.0, 2)
-    alone = np.sqrt(1.0 - np.broadcast_to(doubt.together, N))
-    own = np.concatenate(
-        [np.sqrt(1.0 - doubt.common_p) * alone * doubt.p, np.sqrt(1.0 - doubt.common_q) * alone * doubt.q]
-    )
-    ratio = changed[noticed] / (root * np.maximum(own[noticed], EXACT))
+    ratio = changed[noticed] / (root * np.maximum(doubt.own.ravel()[noticed], EXACT))
     return min(float(ratio.max(initial=0.0)) ** 2, FARTHEST)
 
 
@@ -182,9 +178,9 @@ def _powers(
     unsettled, doubt = _unsettled(design, predicted, measured.uses_q), design.doubt
     if uncertainty.usual and unsettled is None and doubt.sudden_p is None:
         return []
-    frame, smooth = usual(measured.frame), doubt.smooth
-    p = _wider(frame.p_error, smooth.p, uncertainty.p[0] > 1.0, doubt.sudden_p)
-    q = _wider(frame.q_error, smooth.q, uncertainty.q[0] > 1.0, doubt.sudden_q)
+    frame = usual(measured.frame)
+    p = _wider(frame.p_error, doubt.smooth_p, uncertainty.p[0] > 1.0, doubt.sudden_p)
+    q = _wider(frame.q_error, doubt.smooth_q, uncertainty.q[0] > 1.0, doubt.sudden_q)
     power = np.concatenate([p, q if unsettled is None else np.hypot(q, unsettled)])
     which = indices(power > 0.0)
     return [design.sensitivities.numbered(which) * power[which]] if which.size else []

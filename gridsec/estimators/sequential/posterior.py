@@ -611,6 +611,8 @@ class LoadDoubt:
         none. `gridsec.estimators.modal.doubts` takes them as unknown at every tick.
     even_p, even_q : (N,)
         Derived: half-widths of uniform errors with standard deviations p and q, pu.
+    smooth_p, smooth_q : (N,)
+        Derived: p and q without their sudden parts, pu.
 
     Raises
     ------
@@ -629,6 +631,8 @@ class LoadDoubt:
     sudden_q: Floats | None = None
     even_p: Floats = field(init=False, repr=False)
     even_q: Floats = field(init=False, repr=False)
+    smooth_p: Floats = field(init=False, repr=False)
+    smooth_q: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         problems = [
@@ -654,18 +658,24 @@ class LoadDoubt:
             if not (np.greater_equal(getattr(self, name), 0) & np.less_equal(getattr(self, name), 1)).all()
         ]
         raise_if_any(problems)
-        for name, std in (("even_p", self.p), ("even_q", self.q)):
-            object.__setattr__(self, name, np.sqrt(3.0) * np.maximum(std, EXACT))
+        for name, std, sudden in (("p", self.p, self.sudden_p), ("q", self.q, self.sudden_q)):
+            object.__setattr__(self, f"even_{name}", np.sqrt(3.0) * np.maximum(std, EXACT))
+            smooth = std if sudden is None else np.sqrt(std**2 - sudden**2)
+            object.__setattr__(self, f"smooth_{name}", smooth)
 
     @property
     def smooth(self) -> LoadDoubt:
         """The same without the sudden parts."""
-        if self.sudden_p is None or self.sudden_q is None:
+        if self.sudden_p is None:
             return self
-        p, q = self.p**2 - self.sudden_p**2, self.q**2 - self.sudden_q**2
-        return replace(
-            self, p=np.sqrt(np.maximum(p, 0.0)), q=np.sqrt(np.maximum(q, 0.0)), sudden_p=None, sudden_q=None
-        )
+        return replace(self, p=self.smooth_p, q=self.smooth_q, sudden_p=None, sudden_q=None)
+
+    @property
+    def own(self) -> Floats:
+        """Standard deviations of the parts of p and q that are independent of other customers, (2, N), pu."""
+        alone = np.sqrt(1.0 - self.together)
+        p, q = np.maximum(self.p, EXACT), np.maximum(self.q, EXACT)
+        return np.stack([np.sqrt(1.0 - self.common_p) * alone * p, np.sqrt(1.0 - self.common_q) * alone * q])
 
 
 def _sizes(values: Floats | None) -> bool:

@@ -59,6 +59,7 @@ def some(*meters: int) -> Bools:
 
 
 NONE = some()
+OWN = METERS + np.arange(METERS)
 
 
 def test_the_evidence_is_the_cost_without_the_penalty_of_meters() -> None:
@@ -230,8 +231,8 @@ def test_customers_with_false_powers_contest_an_honest_meter() -> None:
 def test_customers_are_added_while_the_evidence_grows() -> None:
     """Each set has one customer more, the best of all, within the promise and with possible powers."""
     given = customers(0.7 * some(0, 9), 3.0 * some(0, 9) + 2.0 * some(3))
-    J, free = np.append(some(4), some(7)), replace(given, charge=np.zeros(2 * METERS))
-    found = list(collusion._customers(given, J, some(4), NONE, near(2, powers=True)))
+    rest, free = np.append(NONE, some(7)), replace(given, charge=np.zeros(2 * METERS))
+    found = list(collusion._customers(given, rest, some(4), NONE, 4, OWN))
     assert [int(each[:METERS].sum()) for _, each in found] == [1, 2]
     assert all((each[:METERS] == each[METERS:]).all() for _, each in found)
     every = [np.append(some(k), some(k)) for k in range(METERS) if k != 4]
@@ -242,8 +243,7 @@ def test_customers_are_added_while_the_evidence_grows() -> None:
     # A better customer with an impossible power ends no search.
     first = found[0][1]
     given.bound[METERS:][first[METERS:]] = 0.01
-    other = next(collusion._customers(given, J, some(4), NONE, near(2, powers=True)))
+    other = next(collusion._customers(given, rest, some(4), NONE, 4, OWN))
     assert not (other[1] & first).any()
-    assert not list(collusion._customers(bounded, J, some(4), NONE, near(2, powers=True)))
-    only = np.append(some(4), NONE)
-    assert not list(collusion._customers(given, only, some(4), NONE, near(2, powers=True)))
+    assert not list(collusion._customers(bounded, rest, some(4), NONE, 4, OWN))
+    assert not list(collusion._customers(given, np.append(NONE, NONE), some(4), NONE, 4, OWN))
