@@ -41,7 +41,7 @@ from gridsec.estimators.modal.classes import Classes
 from gridsec.estimators.modal.costs import SearchProblem, cost
 from gridsec.estimators.modal.detector import SIZE, Detector, Evidence
 from gridsec.estimators.modal.estimate import Estimated, Estimator
-from gridsec.estimators.modal.filter import FilterState, Interval, Update
+from gridsec.estimators.modal.filter import FilterState, Update
 from gridsec.estimators.modal.laterals import groups
 from gridsec.estimators.modal.masking import Masked
 from gridsec.estimators.modal.mirrors import Neighbourhoods
@@ -330,8 +330,7 @@ def step(  # noqa: PLR0917  # the state, and one tick
     if update.exact is not None:
         if pinned and not suspected:
             suspected = replay.carried(made, state.detector.onsets, state.static, pinned)
-        gap = Interval(h, jump)
-        suspected = tuple(replay.follow(made, each, update.exact, gap) for each in suspected)
+        suspected = tuple(replay.follow(made, each, update.exact, update.gap) for each in suspected)
     others = tuple(rivals.follow(each, t, m, seen, unknown, jump) for each in state.rivals)
     if evidence.log_m >= core.limit and (not pinned or _elsewhere(evidence, pinned)):
         test = detector.pin(test, evidence.rows)
@@ -343,8 +342,7 @@ def step(  # noqa: PLR0917  # the state, and one tick
     elif pinned and evidence.log_m < CALM * core.limit:
         test, suspected, others = detector.pin(test, evidence.rows[:0]), (), ()
     history = replay.record(state.history, (after, known, test, suspected), m, seen, unknown, jump)
-    rho2 = update.decay[0] ** 2
-    loads = rho2 * state.loads + (1.0 - rho2) + jump
+    loads = update.gap.varied(made, state.loads)
     return CoreState(after, known, test, update, history, suspected, masked, others, beyond, loads), evidence
 
 

@@ -52,6 +52,11 @@ class Interval:
         """Factors rho and rho_b."""
         return exp(-self.h / modes.model.time_s), exp(-self.h / modes.model.fixed_s)
 
+    def varied(self, modes: Modes, before: float, rest: float = 1.0) -> float:
+        """Variance of w after the interval by that before it and that at rest, in that of the loads, 1."""
+        rho2 = self.decay(modes)[0] ** 2
+        return rho2 * before + (1.0 - rho2) * rest + self.jump
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Full:
@@ -164,6 +169,8 @@ class Update:
     ----------
     decay : (2,)
         Factors rho and rho_b of the interval.
+    gap
+        The interval.
     innovation, variance : (t,)
         nu, zero without a meaning where ``score`` is given, and v.
     gain : (2, t)
@@ -176,11 +183,10 @@ class Update:
         Its score in the modes.
     seen : (t,) or None
         Members with a reading; None: all.
-    jump
-        As in `Interval`.
     """
 
     decay: tuple[float, float]
+    gap: Interval
     innovation: Floats
     variance: Floats
     gain: Floats
@@ -188,7 +194,6 @@ class Update:
     exact: Innovation | None = None
     score: Floats | None = None
     seen: Bools | None = None
-    jump: float = 0.0
 
 
 def start(modes: Modes, t: float) -> FilterState:
@@ -231,7 +236,8 @@ def step(  # noqa: PLR0917  # the state, and one tick
     h = t - state.t
     if not h >= 0.0:
         raise InputInvalid([Problem("order", f"t is {t}; it must not be before {state.t}")])
-    rho, rho_b = Interval(h).decay(modes)
+    gap = Interval(h, jump)
+    rho, rho_b = gap.decay(modes)
     cov, shared, v = predicted(modes, state.cov, rho, rho_b, jump)
     whole = seen is None or all_of(seen)
     gain, mean, nu = shared / v, state.mean, np.zeros(v.size)
@@ -245,9 +251,8 @@ def step(  # noqa: PLR0917  # the state, and one tick
         mean += gain * nu
     cov[:2] -= gain * shared[0]
     cov[2] -= gain[1] * shared[1]
-    return FilterState(t, mean, cov), Update(
-        (rho, rho_b), nu, v, gain, seen=None if whole else seen, jump=jump
-    )
+    seen = None if whole else seen
+    return FilterState(t, mean, cov), Update((rho, rho_b), gap, nu, v, gain, seen=seen)
 
 
 def predicted(

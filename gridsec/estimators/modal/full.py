@@ -98,8 +98,7 @@ def step(  # noqa: PLR0917  # the states of both parts, and one tick
         state = replace(state, full=expanded(modes, state, known))
     after, update = modal.step(modes, state, t, m, seen, jump)
     if state.full is not None:
-        gap = Interval(t - state.t, jump)
-        full, innovation = updated(modes, state.full, gap, m, None if whole else seen, unknown)
+        full, innovation = updated(modes, state.full, update.gap, m, None if whole else seen, unknown)
         score = innovation.score @ modes.back[innovation.rows]
         share, since = _share(modes, state.full, update)
         kept, slower = _kept(modes, full.kept, update, share)
@@ -220,7 +219,7 @@ def expected(modes: Modes, before: Full, gap: Interval, rows: Ints) -> Floats:
 
 def _kept(modes: Modes, kept: Floats, update: Update, share: Floats | None) -> tuple[Floats, Floats]:
     """Diagonal covariance after one tick, (3, t), and its gain, (2, t), times the share that was read."""
-    cov, shared, v = modal.predicted(modes, kept, *update.decay, update.jump)
+    cov, shared, v = modal.predicted(modes, kept, *update.decay, update.gap.jump)
     gain = shared / v
     if share is not None:
         gain *= share
@@ -239,7 +238,7 @@ def _share(modes: Modes, before: Full, update: Update) -> tuple[Floats | None, i
         return None, 0
     if before.share is not None and before.since < SHARED and np.array_equal(before.seen, update.seen):
         return before.share, before.since + 1
-    g, v = indices(~update.seen), modal.predicted(modes, before.kept, *update.decay, update.jump)[2]
+    g, v = indices(~update.seen), modal.predicted(modes, before.kept, *update.decay, update.gap.jump)[2]
     if g.size == modes.size:
         return np.zeros(modes.size), 0
     half, _ = lapack.dpotrf((modes.U[g] / v) @ modes.U[g].T, lower=True, clean=True)

@@ -219,8 +219,7 @@ def follow(  # noqa: PLR0917  # the state, and one tick
             suspected = replay.begun(modes, 0, bool(onsets.ramp[0]))
         if suspected is not None:
             suspected = replay.follow(modes, suspected, update.exact, gap)
-    rho2 = gap.decay(modes)[0] ** 2
-    loads = rho2 * before.loads + (1.0 - rho2) * before.unrest + size + jump
+    loads = gap.varied(modes, before.loads, before.unrest) + size
     return replace(
         before,
         filter=state,
