@@ -8,7 +8,8 @@ switches a kettle of 2 kW for 150 s, every ten minutes on average; every fifth c
 14 kW, charges a car with 11 kW from a random moment on. Meters have fixed errors within their class, and
 registers of 1 %.
 
-Powers: `fresh`, of the moment of the voltage; `late`, 60 s old; `held`, read every 60 s at a moment of the
+Powers: `fresh`, of the moment of the voltage; `rising`, the same where kettles and cars need 4 s to reach
+their power; `late`, 60 s old; `held`, read every 60 s at a moment of the
 customer's own and repeated. Stated: nothing; `t_power` on the wire; `p_interval_s` = 60 s in the files.
 
 Columns: runs; runs with an honest meter named; honest meters named; ticks CLEAN, UNDECIDED and ATTACKED, %;
@@ -54,12 +55,15 @@ TAP_EVERY_S = 120.0
 LIES_S = 120.0
 """Length of the manipulation at the end, s."""
 LIE = 0.03
+RISE_S = 4.0
+"""Time in which rising loads reach their power, s."""
 STUCK_S, EMPTY_KW, RESOLUTION_KW = 120.0, 0.05, 0.01
 """Last renewal of stuck registers, s; power of an empty house and resolution of a register, kW."""
 UNCHANGED = (("empty", 1), ("empty", 6), ("stuck", 6), ("stuck", 28), ("stuck", 57))
 """Kinds of unchanged powers and their number of customers, of 57."""
 CASES = (
     ("fresh", ""),
+    ("rising", ""),
     ("late", ""),
     ("late", "t_power"),
     ("late", "p_interval_s"),
@@ -108,7 +112,7 @@ class World:
 
 
 @lru_cache(maxsize=64)
-def world(seed: int, duration_s: int, tap_step_pu: float = 0.0) -> World:
+def world(seed: int, duration_s: int, tap_step_pu: float = 0.0, rise_s: float = 0.0) -> World:
     """One run.
 
     Parameters
@@ -119,6 +123,8 @@ def world(seed: int, duration_s: int, tap_step_pu: float = 0.0) -> World:
         Length, s.
     tap_step_pu
         Height of the steps of the transformer's tap changer, one in each interval of `TAP_EVERY_S`.
+    rise_s
+        Time in which a load reaches its power, s.
     """
     where, random = site(0.0), np.random.default_rng([seed, 60])
     t = START + np.arange(-LATE_S, duration_s)
@@ -132,6 +138,9 @@ def world(seed: int, duration_s: int, tap_step_pu: float = 0.0) -> World:
             on[(t >= begin) & (t < begin + KETTLE_S), k] = KETTLE_KW
         if k % CAR_OF == 0:
             on[t >= random.uniform(START, t[-1]), k] += CAR_KW
+    if rise_s > 0.0:
+        sums = np.cumsum(np.vstack([np.repeat(on[:1], round(rise_s), axis=0), on]), axis=0)
+        on = (sums[round(rise_s) :] - sums[: -round(rise_s)]) / round(rise_s)
     p_kw = np.minimum(0.5 * honest.p_kw + on, peak)
     late = round(LATE_S)
     v, _ = PowerFlow(where).solve_batch(p_kw[late:], honest.q_kvar[late:] + 0.0, honest.v0_volt[late:])
@@ -167,7 +176,11 @@ def run(
         A name of the registry.
     """
     interval = LATE_S if stated == "p_interval_s" else 0.0
-    where, made, truth = site(interval), watcher(interval, estimator), world(seed, duration_s)
+    where, made, truth = (
+        site(interval),
+        watcher(interval, estimator),
+        world(seed, duration_s, rise_s=RISE_S * (how == "rising")),
+    )
     age, random = ages(seed, how, truth.t.size, truth.v.shape[1]), np.random.default_rng([seed, 62])
     liars, sign = (
         random.permutation(truth.v.shape[1]) < truth.v.shape[1] // 3,

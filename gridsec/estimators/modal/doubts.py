@@ -21,21 +21,23 @@ The estimate uses the standard deviations themselves: d is estimated from the re
 
 n being the meters with a reading.
 
-**Loads that jump.** The error of a power follows the power. Where its half-width, and the reactive power that
-the model adds, change by c_j from one frame to the next, the error has changed by a number of the variance
-c_j^2 / 3. With the design's deviations s_j, without common parts,
+**Loads that jump.** The error of a power follows the power. Its half-width l is that of the frame; for a
+reactive power that the model adds, it is that power as well. Let l change by d_j in a tick, and by m_j in the
+same direction shortly before. The error has changed by a number of the variance ``(m_j + d_j)^2 / 3``. The
+part ``m_j^2 / 3`` has been accounted for. With the design's deviations s_j, without common parts,
 
-    sum_j a_j a_j' c_j^2 / 3  <=  r S,   r = max_j c_j^2 / (3 s_j^2).
+    sum_j a_j a_j' (d_j^2 + 2 m_j d_j) / 3  <=  r S,   r = max_j (d_j^2 + 2 m_j d_j) / (3 s_j^2),
 
-The variance of w gains r S in such a tick. Changes below `NOTICED` do not count, and r is at most `FARTHEST`.
-The mean of w stays: what lasts is not renewed with a power. Over intervals longer than `SUDDEN_S` all powers
-change, and w as its model has it.
+where ``m_j <- d_j + exp(-h / RISE_S) m_j``, with 0 in place of the old m_j where the direction turns. The
+variance of w gains r S in such a tick. Movements below `NOTICED` do not count, and r is at most `FARTHEST`.
+The mean of w stays: what lasts is not renewed with a power. Where frames are more than `SUDDEN_S` apart by
+design, all powers change from one to the next, and w as its model has it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import sqrt
+from math import exp, sqrt
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -46,8 +48,7 @@ from gridsec.estimators.plant import usual
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.measurements import ClockSkew, FrameUncertainty, Measurements
 from gridsec.estimators.sequential.posterior import EXACT, UNMETERED
-from gridsec.estimators.sequential.state import Prediction
-from gridsec.interface import Frame, PowerOrigin
+from gridsec.interface import PowerOrigin
 
 WIDER = 10.0
 """Factor on the standard deviations of unknown directions, 1: a lasting error leaves 1 % of its evidence."""
@@ -56,9 +57,11 @@ UNSETTLED = 4.0
 NOTICED = 0.5
 """Change of a voltage, in white deviations, from which on a changed power counts as a load that jumps, 1."""
 SUDDEN_S = 60.0
-"""Longest interval in which powers jump, s. Over longer ones loads change as the AR(1) has it."""
+"""Longest step of a feeder at which powers jump, s. Over longer ones loads change as the AR(1) has it."""
+RISE_S = 10.0
+"""Time in which a movement is forgotten, s: cars and heat pumps start within several seconds."""
 FARTHEST = 10.0
-"""Largest variance of a jump, in that of the loads, 1: a power over three times the usual ones."""
+"""Largest variance of a jump of one tick, in that of the loads, 1: a power over three times the usual."""
 SKEWED = 0.5
 """Change of a voltage within a clock offset from which on the reading is unknown, in white deviations, 1."""
 
@@ -91,7 +94,7 @@ def unknown(
     design: SequentialDesign,
     measured: Measurements,
     uncertainty: FrameUncertainty,
-    predicted: Prediction,
+    injected: Floats,
     skew: ClockSkew | None,
 ) -> Unknown | None:
     """Directions that a frame leaves unknown; None for none.
@@ -102,12 +105,12 @@ def unknown(
         The front end, and the measurements of the frame.
     uncertainty
         Uncertainty of the frame beyond that of the design.
-    predicted
-        The frame by the model.
+    injected : (m,)
+        Half-widths of the errors of the injections, pu.
     skew
         Changes of the voltages within clock offsets.
     """
-    columns = _powers(design, measured, uncertainty, predicted)
+    columns = _powers(design, measured, uncertainty, injected)
     metered = np.asarray(measured.busbar_metered)
     places = design.prior.variance.size
     if not all_of(metered):
@@ -137,8 +140,26 @@ def reach(design: SequentialDesign) -> Floats:
     return np.asarray((np.abs(columns) / np.sqrt(design.white)[:, None]).max(axis=0))
 
 
-def jump(design: SequentialDesign, reach: Floats, before: Frame | None, measured: Measurements) -> float:
-    """Variance of a jump of the loads' errors where reported powers jump, in that of the loads, 1.
+@dataclass(frozen=True, slots=True, eq=False)
+class Movements:
+    """Half-widths of the powers' errors, active then reactive, pu. N customers.
+
+    Attributes
+    ----------
+    level : (2 N,)
+        l of the last reading of each power, with the sign of the reactive power; NaN before the first.
+    moved : (2 N,)
+        m, the last movement in one direction.
+    """
+
+    level: Floats
+    moved: Floats
+
+
+def jump(
+    design: SequentialDesign, reach: Floats, before: Movements | None, measured: Measurements, h: float
+) -> tuple[float, Movements]:
+    """Variance of a jump of the loads' errors, in that of the loads, 1, and the movements with this frame.
 
     The reactive error of a load that is switched on may be all of the reactive power that the model adds.
 
@@ -146,36 +167,39 @@ def jump(design: SequentialDesign, reach: Floats, before: Frame | None, measured
     ----------
     design, reach
         The front end, and the reach of its powers.
-    before, measured
-        The last frame, and the measurements of this one.
+    before
+        Movements up to the last frame; None before the first.
+    measured, h
+        The measurements of this frame, and the interval from the last one, s.
     """
-    if before is None or measured.frame.t - before.t > SUDDEN_S:
-        return 0.0
-    frame, before, N, root = usual(measured.frame), usual(before), design.customers, sqrt(3.0)
-    changed = np.empty(2 * N)
-    np.abs(frame.p_error - before.p_error, out=changed[:N])
-    np.add(np.abs(frame.q_error - before.q_error), np.abs(frame.q - before.q), out=changed[N:])
-    noticed = changed * reach > root * NOTICED
-    if not any_of(noticed):
-        return 0.0
-    noticed[N:] &= ~measured.uses_q
-    for origin in (frame.p_origin, before.p_origin):
-        if origin is not None:
-            # Missing powers, and those that come back, are compared with no other frame.
-            noticed &= np.tile(origin == PowerOrigin.READ, 2)
-    doubt = design.doubt
+    frame, doubt = usual(measured.frame), design.doubt
+    assumed = np.where(measured.uses_q, 0.0, frame.q)
+    level = np.concatenate([frame.p_error, assumed + np.copysign(frame.q_error, frame.q)])
     if doubt.sudden_p is not None:
         # Unknown directions of every frame.
-        noticed &= np.tile(doubt.sudden_p == 0.0, 2)
-    ratio = changed[noticed] / (root * np.maximum(doubt.own.ravel()[noticed], EXACT))
-    return min(float(ratio.max(initial=0.0)) ** 2, FARTHEST)
+        level[np.tile(doubt.sudden_p > 0.0, 2)] = 0.0
+    if frame.p_origin is not None:
+        # Powers that come back are compared with their last reading.
+        read = np.tile(frame.p_origin == PowerOrigin.READ, 2)
+        level = np.where(read, level, np.nan if before is None else before.level)
+    if before is None:
+        return 0.0, Movements(level, np.zeros(level.size))
+    change, moved = np.nan_to_num(level - before.level, copy=False), exp(-h / RISE_S) * before.moved
+    moved[moved * change < 0.0] = 0.0
+    now = Movements(level, moved + change)
+    noticed = np.abs(now.moved) * reach > sqrt(3.0) * NOTICED
+    if design.step_s > SUDDEN_S or not any_of(noticed):
+        return 0.0, now
+    gained = change[noticed] * (change[noticed] + 2.0 * moved[noticed])
+    ratio = gained / (3.0 * np.maximum(doubt.own.ravel()[noticed], EXACT) ** 2)
+    return min(float(ratio.max()), FARTHEST), now
 
 
 def _powers(
-    design: SequentialDesign, measured: Measurements, uncertainty: FrameUncertainty, predicted: Prediction
+    design: SequentialDesign, measured: Measurements, uncertainty: FrameUncertainty, injected: Floats
 ) -> list[Floats]:
     """Directions of powers and injections, none or (n, k)."""
-    unsettled, doubt = _unsettled(design, predicted, measured.uses_q), design.doubt
+    unsettled, doubt = _unsettled(design, injected, measured.uses_q), design.doubt
     if uncertainty.usual and unsettled is None and doubt.sudden_p is None:
         return []
     frame = usual(measured.frame)
@@ -196,10 +220,10 @@ def _wider(error: Floats, known: Floats, wider: Bools, sudden: Floats | None) ->
     return np.where(wider if sudden is None else wider | (sudden > 0.0), np.sqrt(more), 0.0)
 
 
-def _unsettled(design: SequentialDesign, predicted: Prediction, metered: Bools) -> Floats | None:
+def _unsettled(design: SequentialDesign, injected: Floats, metered: Bools) -> Floats | None:
     """Standard deviation of injections known far less well than the design supposes, (N,), pu."""
     droop, N = design.plant.droop, design.customers
-    error = droop.per_customer(predicted.injection_error.error, N)
+    error = droop.per_customer(injected, N)
     error /= np.sqrt(3.0)
     usually = design.injections + droop.per_customer(design.mismatch, N)
     out = error > UNSETTLED * np.maximum(usually, EXACT)

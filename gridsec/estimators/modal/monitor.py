@@ -8,6 +8,7 @@ A step, by module:
 
     sequential.measurements, step   front end: plausibility, observer of the inverters with its certificate,
                                     loss-corrected voltages by the model
+    drive                           inverters without readings that jump or are accused
     doubts                          directions that the frame leaves unknown
     core                            filter, detector, search, masking
     verdict                         evidence of each meter, decision, explanations
@@ -30,10 +31,10 @@ from functools import partial
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, changed
-from gridsec.estimators.modal import classes, core, doubts, full, masking, record, verdict
+from gridsec.estimators.modal import classes, core, doubts, drive, full, masking, record, verdict
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
-from gridsec.estimators.modal.doubts import Unknown
+from gridsec.estimators.modal.doubts import Movements, Unknown
 from gridsec.estimators.modal.estimate import Reconstructed, Spread
 from gridsec.estimators.modal.record import Record
 from gridsec.estimators.modal.replay import Reading
@@ -53,7 +54,6 @@ from gridsec.estimators.sequential.device_checks import (
     track_busbar,
 )
 from gridsec.estimators.sequential.measurements import (
-    FrameUncertainty,
     Measurements,
     checked,
     measurements,
@@ -76,12 +76,12 @@ from gridsec.estimators.sequential.output import BoundInputs
 from gridsec.estimators.sequential.posterior import UNMETERED, LoadDoubt
 from gridsec.estimators.sequential.reading_history import forget_readings
 from gridsec.estimators.sequential.state import (
+    InjectionError,
     ObserverRecord,
     Prediction,
     SequentialState,
     SuspicionRecord,
 )
-from gridsec.estimators.sequential.step import predict
 from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.certificates import Certificate
 
@@ -94,8 +94,6 @@ LOOKS = 16
 """Searches per age of the suspected onset: explanations change ever more slowly."""
 SETTLING = 32
 """Largest number of ticks at the start of a run that the core gives up for complete readings."""
-JUMP = 6.0
-"""Standard deviations of an innovation beyond which a reading does not drive an inverter, 1."""
 HELD = 8
 """Readings from a jump on for which the verdict is open: log M is evaluated twice in them."""
 PAUSE = 60.0
@@ -188,6 +186,10 @@ class ModalState:
         Record of the learned errors; None before the first tick.
     held : (p,)
         Ticks for which a reading that jumped, and drove no inverter, leaves the verdict open.
+    injections
+        Errors of the observed injections, as `drive` has them.
+    movements
+        Movements of the powers up to the last frame; None before the first.
     """
 
     front: SequentialState
@@ -199,6 +201,8 @@ class ModalState:
     due: int
     kept: Record | None
     held: Ints
+    injections: InjectionError
+    movements: Movements | None = None
 
     @property
     def attack_kinds(self) -> AttackKinds:
@@ -228,7 +232,7 @@ def init(design: ModalDesign, t: float, commission: Commission | None = None) ->
     p = kernel.modes.size
     counts = np.zeros(phases.std.size - p - phases.powers, dtype=np.intp)
     none, inverters = np.zeros(p, dtype=np.intp), np.zeros(design.plant.droop.tau.size, dtype=np.intp)
-    return ModalState(front, begun, None, none, counts, inverters, 0, before, none)
+    return ModalState(front, begun, None, none, counts, inverters, 0, before, none, front.injection_error)
 
 
 def _begun(kernel: Core, before: Record | None, t: float) -> CoreState:
@@ -260,7 +264,11 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
         front, given.uncertainty, frame, measured.available, measured.busbar_metered
     )
     own, trusted = own_errors(design, state.core), given.trust.trusted
-    given, measured, predicted = _driven(design, state, given, measured, uncertainty, own)
+    given, measured, predicted = drive.driven(
+        front, design.core, state.core, given, measured, uncertainty.sizes, own
+    )
+    h = frame.t - given.t
+    injections = drive.followed(front, state.injections, given, measured, predicted, h)
     jumps = trusted & ~given.trust.trusted
     held = state.held
     if any_of(jumps) or any_of(held):
@@ -279,8 +287,9 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
         attack_kinds=kinds,
         v0_squared=measured.v0_squared,
     )
-    open_ = doubts.unknown(front, measured, uncertainty, predicted, skew)
-    seen, whole, m = measured.available, all_of(measured.available), measured.y - _expected(v2, own)
+    open_ = doubts.unknown(front, measured, uncertainty, injections.error, skew)
+    jump, movements = doubts.jump(front, design.reach, state.movements, measured, h)
+    seen, whole, m = measured.available, all_of(measured.available), measured.y - drive.expected(v2, own)
     if not whole:
         m = np.where(seen, m, 0.0)
     kernel = _begun_anew(design, state, frame.t) if open_ is None and whole else state.core
@@ -291,59 +300,17 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
         m,
         None if whole else seen,
         None if open_ is None else open_.wide,
-        doubts.jump(front, design.reach, given.frame, measured),
+        jump,
     )
-    after, evidence = _identified(design, changed(state, front=now, core=kernel), evidence, measured.uses_q)
+    after = changed(state, front=now, core=kernel, movements=movements)
+    after, evidence = _identified(design, after, evidence, measured.uses_q)
     if after.front.busbar is not now.busbar:
         # A phase named at this tick is not metered any more.
         metered = np.asarray(measured.busbar_metered) & after.front.busbar.trusted
         measured = replace(measured, busbar_metered=metered if metered.size > 1 else bool(metered[0]))
-        open_ = doubts.unknown(front, measured, uncertainty, predicted, skew)
-    tick = _Tick(measured, predicted, open_, evidence, m, held)
+        open_ = doubts.unknown(front, measured, uncertainty, injections.error, skew)
+    tick = _Tick(measured, predicted, injections, open_, evidence, m, held)
     return _answered(design, after, tick)
-
-
-def _expected(v2: Floats, own: Floats) -> Floats:
-    """Readings by the model without the error of each register at 1 pu, (p,), squared pu."""
-    return v2 + own * (v2 - 1.0)
-
-
-def _driven(  # noqa: PLR0917  # the state, and one frame
-    design: ModalDesign,
-    state: ModalState,
-    given: SequentialState,
-    measured: Measurements,
-    uncertainty: FrameUncertainty,
-    own: Floats,
-) -> tuple[SequentialState, Measurements, Prediction]:
-    """Front end, measurements and prediction without inverters driven by a reading that jumps.
-
-    A manipulated reading that drives an inverter of the model moves the residuals of all others. A reading
-    beyond `JUMP` standard deviations of its innovation therefore counts as not trusted at this tick.
-    """
-    front, kernel = design.front, state.core
-    predicted = predict(front, given, measured, uncertainty.sizes)
-    if kernel.update is None or not front.meter_of.size or given.x is None:
-        return given, measured, predicted
-    m = measured.y - _expected(predicted.v2_bus[front.prior.meters], own)
-    # The variance is at least that of the white errors.
-    far = np.abs(verdict.offsets(design.core, kernel, m)) > JUMP * design.core.modes.noise_std
-    if not any_of(far):
-        return given, measured, predicted
-    drives = np.zeros(m.size, dtype=np.bool_)
-    drives[front.meter_of[front.meter_of >= 0]] = True
-    drives &= measured.available & given.trust.trusted
-    if not any_of(drives & far):
-        return given, measured, predicted
-    off, std = verdict.deviations(design.core, kernel, m)
-    jumps = drives & (np.abs(off) > JUMP * std)
-    if not 0 < np.count_nonzero(jumps) <= design.max_attacked:
-        # Where most readings jump, the busbar's or the loads have; then no inverter can do without them.
-        return given, measured, predicted
-    trusted = given.trust.trusted & ~jumps
-    given = changed(given, trust=replace(given.trust, trusted=trusted))
-    measured = measurements(front, measured.frame, trusted, given.busbar.trusted, given.v0_squared)
-    return given, measured, predict(front, given, measured, uncertainty.sizes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -352,6 +319,7 @@ class _Tick:
 
     measured: Measurements
     predicted: Prediction
+    injections: InjectionError
     unknown: Unknown | None
     evidence: Evidence
     m: Floats  # (p,) residuals, 0 without a reading
@@ -549,6 +517,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         record.kept(design.core.modes, state.kept, kernel.filter, kernel.static, now.ticks) if calm else None
     )
     learning = _gathered(design, trust, tick, suspected=doubtful)
+    new = now.trust.trusted & ~trust.trust.trusted
     after = changed(
         trust,
         t=tick.measured.frame.t,
@@ -557,14 +526,15 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         x=tick.predicted.x,
         transient=tick.predicted.transient,
         model_driven=tick.predicted.model_driven,
-        injection_error=_injection_error(front, now, tick, trust.trust.trusted),
+        injection_error=drive.accused(front, tick.predicted.injection_error, new),
         inverter_checks=checks,
         attack_kinds=kinds,
         busbar=busbar,
         learning=learning,
         last=(estimate, answer),
     )
-    out = changed(state, front=after, kept=kept or state.kept, held=tick.held)
+    injections = drive.accused(front, tick.injections, new)
+    out = changed(state, front=after, kept=kept or state.kept, held=tick.held, injections=injections)
     return (out if learning is None else _learned(design, out)), estimate, answer
 
 
@@ -597,17 +567,9 @@ def _trust(
     )
 
 
-def _injection_error(
-    front: SequentialDesign, now: SequentialState, tick: _Tick, trusted: Bools
-) -> front_state.InjectionError:
-    """Errors of the injections: unknown where a meter accused at this tick drove the inverter."""
-    new, error = now.trust.trusted & ~trusted, tick.predicted.injection_error
-    return error.reset((front.meter_of >= 0) & new[front.meter_of]) if any_of(new) else error
-
-
 def _settled(design: ModalDesign, predicted: Prediction) -> bool:
     """The observer's initial transient is a small part of the error at which a reading stands out."""
-    seen = np.maximum(design.front.allowed, JUMP * design.core.modes.noise_std)
+    seen = np.maximum(design.front.allowed, drive.JUMP * design.core.modes.noise_std)
     return all_of(predicted.transient <= design.options.settled * seen)
 
 
@@ -831,7 +793,9 @@ def renew(design: ModalDesign, state: ModalState, which: Bools) -> ModalState:
         trust=state.front.trust.replaced(which),
     )
     zero, held = (0 * state.streak, 0 * state.phases, 0 * state.inverters), np.where(which, 0, state.held)
-    return ModalState(now, begun, None, *zero, 0, record.made(modes, opened, kernel.static), held)
+    return ModalState(
+        now, begun, None, *zero, 0, record.made(modes, opened, kernel.static), held, state.injections
+    )
 
 
 def progress(design: ModalDesign, commission: Commission) -> LearningProgress:

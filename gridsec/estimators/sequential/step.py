@@ -547,10 +547,8 @@ def update_injection_error(
     and metered busbar phases; None where all follow their meters.
     """
     plant, droop, span = design.plant, design.plant.droop, before.span
-    hold = np.abs(given - before.input)
     width = design.reading_errors.of(given)
-    wider = np.maximum(width, before.width)
-    target = np.minimum(span, droop.slope * (wider + hold) + design.mismatch)
+    target = injection_target(design, before, given, width)
     if free is not None:
         (which, powers, metered), size = free, plant.feeder.bus.size
         # The map is monotone: from above its images stay above the error.
@@ -562,9 +560,31 @@ def update_injection_error(
         for _ in range(_ITERATIONS):
             model = powers.linear_error(plant, droop.per_customer(top, size)) + lost + busbar
             width = np.where(which, model[droop.customer], width)
-            wider = np.maximum(width, before.width)
-            image = np.minimum(span, droop.slope * (wider + hold) + design.mismatch)
+            image = injection_target(design, before, given, width)
             target = np.where(which, image, target)
             top = np.where(which, np.maximum(before.error, image), top)
-    error = target + np.exp(-h / droop.tau) * (before.error - target)
-    return InjectionError(error, given, width, span)
+    return relaxed(design, before, given, width, target, h)
+
+
+def injection_target(
+    design: SequentialDesign, before: InjectionError, given: Floats, width: Floats
+) -> Floats:
+    """Largest errors of the set-points between two frames, (m,), pu.
+
+    given, width: (m,) squared voltage at each input and its largest error, squared pu.
+    """
+    wider, hold = np.maximum(width, before.width), np.abs(given - before.input)
+    return np.asarray(np.minimum(before.span, design.plant.droop.slope * (wider + hold) + design.mismatch))
+
+
+def relaxed(  # noqa: PLR0917
+    design: SequentialDesign,
+    before: InjectionError,
+    given: Floats,
+    width: Floats,
+    target: Floats,
+    h: float,
+) -> InjectionError:
+    """Errors a time h later with those of the set-points, `target` (m,), pu, in between."""
+    error = target + np.exp(-h / design.plant.droop.tau) * (before.error - target)
+    return InjectionError(error, given, width, before.span)

@@ -179,52 +179,68 @@ def test_kettles_and_cars_are_no_evidence_for_modal_once_the_age_is_stated(seed:
     assert of_bound <= 1.0
 
 
-@pytest.mark.canary("1")
+@pytest.mark.canary("1-rising")
+@pytest.mark.parametrize("how", ["fresh", "rising"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_loads_that_jump_are_no_evidence_for_modal(seed: int) -> None:
+def test_loads_that_jump_are_no_evidence_for_modal(seed: int, how: str) -> None:
     """Powers of the moment: a car of 11 kW takes less reactive power than the model adds for it."""
-    seen, _, of_bound = run(seed, 240, "fresh", "", MODAL)
+    seen, _, of_bound = run(seed, 240, how, "", MODAL)
     assert (seen["clean"], seen["honest"], seen["named"]) == (seen["ticks"], 0, seen["liars"])
     assert of_bound <= 1.0
 
 
 def test_loads_jump_with_their_reported_powers(site: Site) -> None:
-    """By the largest ratio of variances of a power; not where one is missing, is back, or is metered."""
+    """By the largest ratio of variances of a power since its last reading; not where it is metered."""
     made = design(choose(site, estimator=MODAL)).design
     assert isinstance(made, ModalDesign)
     front, state = made.front, init(made, T).front
     j, root = int(made.reach[site.meters + front.customers].argmax()), np.sqrt(3.0)
-    silent = np.full(site.meters.size, np.nan)
+    silent, gap = np.full(site.meters.size, np.nan), np.nan
 
     def reading(kw: float, reported: float = np.nan) -> Snapshot:
         p, q = np.ones(silent.size), silent.copy()
         p[j], q[j] = kw, reported
         return replace(said(site), p_kw=p, q_kvar=q)
 
-    def jump(before: Snapshot, now: Snapshot, factor: float = 10.0, of: SequentialDesign = front) -> float:
-        known, frame = state.trust.trusted, to_frame(site, now)
-        measured = measurements(front, frame, known, state.busbar.trusted, state.v0_squared)
-        return doubts.jump(of, factor * made.reach, to_frame(site, before), measured)
+    def jumps(
+        *given: float | Snapshot, h: float = 1.0, factor: float = 10.0, of: SequentialDesign = front
+    ) -> list[float]:
+        """Variances of the jumps to all snapshots, or active powers in kW, but the first."""
+        out, moved = list[float](), None
+        for one in given:
+            frame = to_frame(site, one if isinstance(one, Snapshot) else reading(one))
+            known = measurements(front, frame, state.trust.trusted, state.busbar.trusted, state.v0_squared)
+            ratio, moved = doubts.jump(of, factor * made.reach, moved, known, h)
+            out.append(ratio)
+        assert out[0] == 0.0
+        return out[1:]
 
     one, other, at = to_frame(site, reading(1.0)), to_frame(site, reading(4.0)), site.meters[j]
     c = abs(one.q[at] - other.q[at]) + abs(one.q_error[at] - other.q_error[at])
     share = (c / root / front.doubt.q[at]) ** 2 / (1.0 - front.doubt.common_q)
     assert 0.0 < share < 1.0
-    assert jump(reading(1.0), reading(4.0)) == pytest.approx(share)
-    assert jump(reading(4.0), reading(1.0)) == jump(reading(1.0), reading(4.0))
+    assert jumps(1.0, 4.0, 1.0) == pytest.approx([share, share])
+    # A load that rises and falls within some ticks: the parts of its error are not independent.
+    rising, shift = jumps(1.0, 2.0, 3.0, 4.0, 2.5, 1.0, h=1e-6), np.array([1.0, 3.0, 5.0, 2.25, 6.75])
+    assert rising == pytest.approx(share * shift / 9.0, rel=1e-5)
+    # Movements a minute apart are independent.
+    assert jumps(1.0, 2.5, 4.0, h=60.0) == pytest.approx([share / 4.0, share / 4.0], rel=0.01)
     # No meter would see it.
-    assert jump(reading(1.0), reading(4.0), 1.0) == 0.0
+    assert jumps(1.0, 4.0, factor=1.0) == [0.0]
     sure = replace(front.doubt, q=front.doubt.q / 100.0)
-    assert jump(reading(1.0), reading(4.0), of=replace(front, doubt=sure)) == doubts.FARTHEST
-    assert jump(reading(np.nan), reading(4.0)) == jump(reading(1.0), reading(np.nan)) == 0.0
-    assert jump(reading(1.0), reading(4.0, reported=0.3)) < jump(reading(1.0), reading(4.0))
-    frame = measurements(front, one, state.trust.trusted, state.busbar.trusted, state.v0_squared)
-    assert doubts.jump(front, made.reach, None, frame) == 0.0
-    later = replace(reading(4.0), t=T + doubts.SUDDEN_S + 1.0)
-    assert jump(reading(1.0), later) == 0.0
+    assert jumps(1.0, 4.0, of=replace(front, doubt=sure)) == [doubts.FARTHEST]
+    # A power that comes back is compared with its last reading, and its first one with none.
+    assert jumps(1.0, gap, gap, 4.0) == pytest.approx([0.0, 0.0, share])
+    assert jumps(gap, 4.0, 4.0) == [0.0, 0.0]
+    # The meter takes the place of the power that the model adds.
+    metered = reading(1.0, reported=0.3)
+    whole = abs(one.q[at]) + one.q_error[at]
+    assert jumps(1.0, metered) == pytest.approx([share * (whole / c) ** 2])
+    assert jumps(metered, reading(4.0, reported=0.3)) == [0.0]
+    assert jumps(1.0, 4.0, of=replace(front, step_s=doubts.SUDDEN_S + 1.0)) == [0.0]
     # Powers of a stated age are unknown directions of every frame already.
     stale = replace(front.doubt, sudden_p=0.5 * front.doubt.p, sudden_q=0.5 * front.doubt.q)
-    assert jump(reading(1.0), reading(4.0), of=replace(front, doubt=stale)) == 0.0
+    assert jumps(1.0, 4.0, of=replace(front, doubt=stale)) == [0.0]
 
 
 def test_an_unchanged_power_has_the_age_of_its_first_reading(site: Site) -> None:

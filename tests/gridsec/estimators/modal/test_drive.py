@@ -1,0 +1,66 @@
+"""Inverters of the model with false readings at their inputs, against the injections of an honest run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gridsec.arrays import Floats
+from gridsec.estimators.modal import doubts
+from gridsec.estimators.modal.monitor import ModalDesign, ModalState, design, init, step
+from gridsec.interface import Decision, Frame, Verdict
+from tests.gridsec.estimators.sequential.test_monitor import prepare
+from tests.gridsec.street import Street, make_plant
+
+ONSET, TICKS = 60, 110
+LIE = 0.06
+"""Squared voltage, pu: 3 %."""
+
+
+def watched(lies: tuple[int, ...]) -> tuple[ModalDesign, list[tuple[ModalState, Verdict, Floats]]]:
+    """Meters that read 3 % too high and too low by turns, with all states, verdicts and true injections."""
+    plant = make_plant(np.random.default_rng(5), customers=12, drop=0.03)
+    front = prepare(plant)
+    made, street = design(plant, doubt=front.doubt, step_s=1.0), Street(plant, np.random.default_rng(6))
+    state, out = init(made, street.t), []
+    for k in range(TICKS):
+        street.advance(1.0)
+        frame = street.frame()
+        if k >= ONSET:
+            frame = shifted(frame, lies, LIE if k % 2 else -LIE)
+        state, _, verdict = step(made, state, frame)
+        out.append((state, verdict, street.x.copy()))
+    return made, out
+
+
+def shifted(frame: Frame, meters: tuple[int, ...], by: float) -> Frame:
+    y = frame.y.copy()
+    y[list(meters)] += by
+    return replace(frame, y=y)
+
+
+@pytest.mark.parametrize("lies", [(4,), (4, 7, 9)], ids=["one", "a quarter"])
+def test_readings_that_alternate_leave_the_injections_known(lies: tuple[int, ...]) -> None:
+    """The model's injections stay within their stated errors, and these a part of what is possible."""
+    made, told = watched(lies)
+    front, last = made.front, told[-1][0]
+    for state, _, x in told[ONSET:]:
+        assert state.front.x is not None
+        assert (np.abs(state.front.x - x) <= state.injections.error).all()
+    usual = front.injections[front.plant.droop.customer] + front.mismatch
+    at = np.isin(front.meter_of, lies)
+    assert (last.injections.error < np.sqrt(3.0) * doubts.UNSETTLED * usual)[at].all()
+    assert (last.injections.error < last.front.injection_error.error)[at].all()
+
+
+@pytest.mark.parametrize("lies", [(4,), (4, 7, 9), (3, 4, 7, 9)], ids=["one", "a quarter", "a third"])
+def test_readings_that_alternate_are_never_clean(lies: tuple[int, ...]) -> None:
+    """No honest meter is named, and no tick from the first false reading on is CLEAN."""
+    _, told = watched(lies)
+    honest = ~np.isin(np.arange(12), lies)
+    for _, verdict, _ in told[ONSET:]:
+        assert verdict.decision is not Decision.CLEAN
+        assert not (verdict.suspects & honest).any()
+    assert (told[-1][1].suspects == ~honest).all()
