@@ -276,15 +276,20 @@ class Scores:
         W, squares : (t, q)
             The columns in the modes, those of the members first, and their squares.
         """
-        F = self.information @ squares
+        (k, t), F = self.score.shape, self.information @ squares
+        # One product in place of two: the columns are read once.
+        every = np.concatenate([self.score, self.side.reshape(-1, t)]) @ W
+        y, side = every[:k], every[k:]
         if self.cov.size == 1:
-            F -= self.cov[0, 0] * (self.side[:, 0] @ W) ** 2
+            side *= side
+            side *= self.cov[0, 0]
+            F -= side
         elif self.cov.size:
-            side = self.side @ W
+            side = side.reshape(k, len(self.cov), -1)
             F -= np.einsum("krq,rs,ksq->kq", side, self.cov, side)
         if self.share is not None:
             F[:, : self.share.shape[1]] *= self.share
-        return self.score @ W, F
+        return y, F
 
 
 def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _ALL) -> Scores:
