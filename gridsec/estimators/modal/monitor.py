@@ -114,11 +114,14 @@ class ModalDesign:
         The statistical core.
     reach : (2 N,)
         Largest effect of each power on a meter, as in `doubts.reach`.
+    negligible : (p,)
+        Largest transient of the observer beside the error at which a reading stands out, squared pu.
     """
 
     front: SequentialDesign
     core: Core
     reach: Floats = field(repr=False)
+    negligible: Floats = field(repr=False)
 
     @property
     def plant(self) -> Plant:
@@ -161,7 +164,9 @@ def design(
     `gridsec.estimators.sequential.design.design`, and its errors.
     """
     front = front_design(plant, doubt=doubt, step_s=step_s, options=options, max_attacked=max_attacked)
-    return ModalDesign(front, core.design(front, most), doubts.reach(front))
+    made = core.design(front, most)
+    stands_out = np.maximum(front.allowed, JUMP * made.modes.noise_std)
+    return ModalDesign(front, made, doubts.reach(front), front.options.settled * stands_out)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -497,10 +502,13 @@ def _suspected_busbar(front: SequentialDesign, trust: BusbarTrust, named: Bools)
 def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[ModalState, Estimate, Verdict]:
     """State, estimate and verdict after a tick."""
     front, kernel, now = design.front, state.core, state.front
-    named, seen = kernel.masked.meters, tick.measured.available
+    named, seen, beyond = kernel.masked.meters, tick.measured.available, kernel.exceeding
     suspected = any_of(kernel.detector.pinned)
+    doubtful = suspected or any_of(beyond)
     trust = _trust(design, now, named, state.suspicion)
-    estimate, spread = _estimate(design, state if trust is now else changed(state, front=trust), tick)
+    # While the readings disagree and no search has settled it, no reading bounds a voltage.
+    sure = np.zeros_like(seen) if doubtful else trust.trust.trusted & seen
+    estimate, spread = _estimate(design, state if trust is now else changed(state, front=trust), tick, sure)
     busbar = _busbar(design, now, tick, estimate, spread)
     evidence = verdict.meter_evidence(
         design.core, kernel, tick.evidence, (tick.m, seen), front.options.widest, state.suspicion
@@ -516,12 +524,12 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         named=named,
         unread=np.zeros_like(seen) if tick.unknown is None else tick.unknown.unchecked,
         jumps=tick.held > 0,
-        beyond=kernel.exceeding,
+        beyond=beyond,
         evidence=evidence,
         suspected=suspected,
         explanations=rivals,
         suspicion=state.suspicion,
-        settled=_settled(design, tick.predicted),
+        settled=all_of(tick.predicted.transient <= design.negligible),
         inverters=inverters,
         busbar=busbar.named,
         metered=np.atleast_1d(np.asarray(tick.measured.busbar_metered)),
@@ -543,7 +551,6 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         busbar=given.busbar,
         busbar_attack=given.busbar_off,
     )
-    doubtful = _doubtful(kernel)
     calm = not (doubtful or any_of(named) or any_of(~busbar.trusted))
     kept = (
         record.kept(design.core.modes, state.kept, kernel.filter, kernel.static, now.ticks) if calm else None
@@ -605,12 +612,6 @@ def _injection_error(
     return error.reset((front.meter_of >= 0) & new[front.meter_of]) if any_of(new) else error
 
 
-def _settled(design: ModalDesign, predicted: Prediction) -> bool:
-    """The observer's initial transient is a small part of the error at which a reading stands out."""
-    seen = np.maximum(design.front.allowed, JUMP * design.core.modes.noise_std)
-    return all_of(predicted.transient <= design.options.settled * seen)
-
-
 def _busbar(
     design: ModalDesign, now: SequentialState, tick: _Tick, estimate: Estimate, spread: Callable[[], Floats]
 ) -> BusbarTrust:
@@ -625,8 +626,13 @@ def _busbar(
     return track_busbar(front, now.busbar, measured.busbar_reading, there, v0_squared, variance, allowed)
 
 
-def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Estimate, Callable[[], Floats]]:
-    """Voltages by the model and the core, with standard deviation and bound; the core's variance, (n,)."""
+def _estimate(
+    design: ModalDesign, state: ModalState, tick: _Tick, sure: Bools
+) -> tuple[Estimate, Callable[[], Floats]]:
+    """Voltages by the model and the core, with standard deviation and bound; the core's variance, (n,).
+
+    sure: (p,) meters with a reading that bounds a voltage.
+    """
     front, kernel, measured = design.front, design.core, tick.measured
     plant, now = front.plant, state.front
     errors = core.estimate(kernel, state.core, state.suspicion)
@@ -648,8 +654,6 @@ def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Esti
         if metered
         else np.where(measured.busbar_metered, measured.v0_squared, v2_bus[first])
     )
-    # While the readings disagree and no search has settled it, no reading bounds a voltage.
-    sure = now.trust.trusted & measured.available & (not _doubtful(state.core))
     powers = tick.predicted.powers
     inputs = BoundInputs(
         plant=plant,

@@ -55,9 +55,6 @@ RAMP_S = 600.0
 """Time in which a unit ramp reaches 1, s: the time scale of the loads."""
 
 
-_ALL = slice(None)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Onsets:
     """Rows of onsets, each a step or a ramp. k rows, t modes. A row that is not in use is zero.
@@ -292,7 +289,7 @@ class Scores:
         return y, F
 
 
-def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _ALL) -> Scores:
+def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | None = None) -> Scores:
     """Integrate the directions out.
 
     Parameters
@@ -300,16 +297,16 @@ def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _A
     modes, onsets, static
         The modes, and the information so far.
     rows : (k,)
-        Rows to work on; all by default.
+        Rows to work on; None: all.
     """
-    r = modes.sign.size
-    score, information = onsets.score[rows], onsets.information[rows]
+    r, rows = modes.sign.size, np.arange(onsets.age.size) if rows is None else rows
+    score, information = onsets.score.take(rows, axis=0), onsets.information.take(rows, axis=0)
     share = None if onsets.lost is None else _share(modes, information, onsets.lost[rows])
     busbar = None if onsets.busbar is None else onsets.busbar[rows]
     if not r:
         none = np.zeros((len(score), 0, modes.size)), np.zeros((0, 0))
         return Scores(score, information, *none, share, busbar)
-    cross, G, cov = onsets.cross[rows], modes.directions, static.cov
+    cross, G, cov = onsets.cross.take(rows, axis=0), modes.directions, static.cov
     if r > FEW:
         G, cov = G[:, : modes.busbar], of_busbar(modes, static)
     return Scores(score, information, cross[:, None, :] * G.T, cov, share, busbar)

@@ -105,10 +105,11 @@ def follow(modes: Modes, before: Static, update: Update) -> Static:
     g = before.signature * np.array([[rho], [rho_b]])
     gamma = 1.0 - g[0] - g[1]
     g += update.gain * gamma
-    information = before.information + gamma * gamma / update.variance
-    now = changed(before, information=information)
+    relative = gamma / update.variance
+    information = before.information + relative * gamma
     if update.score is not None:
         # The innovation is exact without theta, which says only how a fault would have been learned.
+        now = changed(before, information=information)
         cov, turn = before.cov, np.zeros(modes.sign.size)
         if modes.sign.size <= FEW:
             cov, turn = current(modes, now).cov, cov @ ((gamma * update.score) @ modes.directions)
@@ -117,30 +118,30 @@ def follow(modes: Modes, before: Static, update: Update) -> Static:
             turn[: modes.busbar] = of_busbar(modes, now) @ ((gamma * update.score) @ G)
         moved, theta = modes.directions @ turn, before.theta + turn
         return Static(g, gamma, before.pull, information, theta, cov, update.score, moved)
-    weighed = update.innovation / update.variance
-    pull = before.pull + (gamma * weighed) @ modes.directions
-    theta, cov = _learned(modes, now, pull)
-    score = weighed - gamma * (modes.directions @ theta) / update.variance
+    pull = before.pull + (relative * update.innovation) @ modes.directions
+    theta, cov = _learned(modes, before, information, pull)
+    score = update.innovation / update.variance
+    score -= relative * (modes.directions @ theta)
     return Static(g, gamma, pull, information, theta, cov, score, modes.directions @ (theta - before.theta))
 
 
-def _learned(modes: Modes, now: Static, pull: Floats) -> tuple[Floats, Floats]:
+def _learned(modes: Modes, before: Static, information: Floats, pull: Floats) -> tuple[Floats, Floats]:
     """Theta of this tick, (r,), and N of this tick or an earlier one, (r, r)."""
     if modes.sign.size > FEW:
-        theta, near = now.theta, CLOSE * float(np.abs(pull).max(initial=0.0))
+        theta, near = before.theta, CLOSE * float(np.abs(pull).max(initial=0.0))
         for _ in range(REFINEMENTS):
-            rest = pull - _precision_times(modes, now, theta)
+            rest = pull - _precision_times(modes, information, theta)
             if float(np.abs(rest).max()) <= near:
-                return theta, now.cov
-            theta = theta + now.cov @ rest
-    cov = _covariance(modes, now.information)
+                return theta, before.cov
+            theta = theta + before.cov @ rest
+    cov = _covariance(modes, information)
     return cov @ pull, cov
 
 
-def _precision_times(modes: Modes, now: Static, theta: Floats) -> Floats:
-    """``N^-1 theta`` of this tick, (r,)."""
+def _precision_times(modes: Modes, information: Floats, theta: Floats) -> Floats:
+    """``N^-1 theta`` by the information (t,), (r,)."""
     G = modes.directions
-    return np.asarray(modes.sign * theta + (now.information * (G @ theta)) @ G)
+    return np.asarray(modes.sign * theta + (information * (G @ theta)) @ G)
 
 
 def current(modes: Modes, now: Static) -> Static:
@@ -177,4 +178,4 @@ def restored(modes: Modes, now: Static) -> Static:
     modes, now
         The modes, and the information so far.
     """
-    return replace(now, pull=_precision_times(modes, now, now.theta)) if modes.sign.size else now
+    return replace(now, pull=_precision_times(modes, now.information, now.theta)) if modes.sign.size else now

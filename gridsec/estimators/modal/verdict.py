@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cache
 from math import inf, log
 from typing import Any
 
@@ -155,18 +154,22 @@ class Answer(Verdict):
     ) -> Answer:
         """Verdict with the function `amounts` of score and threshold, (p,) each; `rest` as in `Verdict`."""
         made = cls(*finding, suspects, PENDING, PENDING, attack, **rest)
-        object.__setattr__(made, "_amounts", cache(amounts))
+        object.__setattr__(made, "_amounts", amounts)
         return made
 
     @deferred(Verdict)
     def score(self) -> Floats:
         """Residual of each meter, squared pu, (p,); NaN without a reading."""
-        return self._amounts()[0]
+        score, threshold = self._amounts()
+        object.__setattr__(self, "threshold", threshold)
+        return score
 
     @deferred(Verdict)
     def threshold(self) -> Floats:
         """Largest score of an honest meter, squared pu, (p,)."""
-        return self._amounts()[1]
+        score, threshold = self._amounts()
+        object.__setattr__(self, "score", score)
+        return threshold
 
 
 def deviations(core: Core, state: CoreState, m: Floats) -> tuple[Floats, Floats]:
