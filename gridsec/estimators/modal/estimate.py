@@ -171,8 +171,8 @@ def honest(
         return Estimated(mean, partial(_full_variance, modes, made, state.full, more))
     w, b = state.mean
     if modes.sign.size:
-        (g_w, g_b), known = static.signature, modes.directions @ static.theta
-        w, b = w - g_w * known, b + (1.0 - g_b) * known
+        g_w, g_b = static.signature
+        w, b = w - g_w * static.constant, b + (1.0 - g_b) * static.constant
     mean = _mean(made, w, b, static.score)
     return Estimated(mean, partial(_variance, modes, made, state.cov, static, more))
 

@@ -12,11 +12,11 @@ with the gain and variance (k, v) of `gridsec.estimators.modal.filter` and gamma
 has the signature ``(gamma - gamma_0 Gamma N Gamma' c) W``, N and c those before the tick. With s, the score
 of the exact innovation,
 
-    Y += gamma s - c * Gamma (theta_t - theta_(t-1)),   y = W' Y
+    a += gamma (s + gamma_0 Gamma theta / v),   Y = a - c * Gamma theta,   y = W' Y
     I = W' (diag(i) - diag(c) Gamma N Gamma' diag(c)) W
 
 and ``exp(y' f - f' I f / 2)`` is the likelihood ratio of the fault against none, given all readings so far.
-``Y = a - c * Gamma theta`` with ``a = sum gamma nu / v``.
+With complete readings a grows by ``gamma nu / v``.
 
 With many directions (more than `static.FEW`) I takes only those of the busbar into account. It is then too
 large by a positive semidefinite matrix, and mixtures of likelihood ratios are too small: their expectation
@@ -70,7 +70,7 @@ class Onsets:
     signature : (2, k, t)
         g of w and of b, after the last update.
     score, information, cross : (k, t)
-        Score of the exact innovation, i and c.
+        a, i and c.
     lost : (k, t) or None
         Part of i at each member that was not read; None where nothing is missing since the filter is modal.
     busbar : (k, b) or None
@@ -177,8 +177,7 @@ def follow(
     gamma = level[:, None] - g[0]
     gamma -= g[1]
     weighed = gamma / update.variance
-    score = gamma * static.score
-    score -= onsets.cross * static.moved
+    score = gamma * (static.score + static.gamma * static.constant / update.variance)
     score += onsets.score
     information = weighed * gamma
     lost, busbar = _lost(modes, onsets, update, gamma), _busbar(modes, onsets, update, static, gamma)
@@ -307,6 +306,7 @@ def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | None = Non
         none = np.zeros((len(score), 0, modes.size)), np.zeros((0, 0))
         return Scores(score, information, *none, share, busbar)
     cross, G, cov = onsets.cross.take(rows, axis=0), modes.directions, static.cov
+    score -= cross * static.constant
     if r > FEW:
         G, cov = G[:, : modes.busbar], of_busbar(modes, static)
     return Scores(score, information, cross[:, None, :] * G.T, cov, share, busbar)
@@ -355,6 +355,7 @@ def joint(modes: Modes, onsets: Onsets, static: Static, row: int) -> Joint:
     score, g, level = onsets.score[row], onsets.signature[:, row], float(onsets.level[row])
     information, shift = np.diag(onsets.information[row]), np.stack([np.diag(each) for each in g])
     if modes.sign.size:
+        score = score - onsets.cross[row] * static.constant
         side = onsets.cross[row][:, None] * modes.directions
         turn = current(modes, static).cov @ side.T
         information -= side @ turn

@@ -59,8 +59,10 @@ class Static:
         Posterior mean of the amounts.
     cov : (r, r)
         N of the tick at which it was computed last.
-    score, moved : (t,)
-        Of the last tick: ``V^-1`` times the exact innovation, and change of ``Gamma theta``, in the modes.
+    score : (t,)
+        ``V^-1`` times the exact innovation of the last tick, in the modes.
+    constant : (t,)
+        ``Gamma theta``.
     """
 
     signature: Floats
@@ -70,7 +72,7 @@ class Static:
     theta: Floats
     cov: Floats = field(repr=False)
     score: Floats
-    moved: Floats
+    constant: Floats
 
 
 def start(modes: Modes) -> Static:
@@ -116,13 +118,13 @@ def follow(modes: Modes, before: Static, update: Update) -> Static:
         elif modes.busbar:
             G = modes.directions[:, : modes.busbar]
             turn[: modes.busbar] = of_busbar(modes, now) @ ((gamma * update.score) @ G)
-        moved, theta = modes.directions @ turn, before.theta + turn
-        return Static(g, gamma, before.pull, information, theta, cov, update.score, moved)
+        theta = before.theta + turn
+        return Static(g, gamma, before.pull, information, theta, cov, update.score, modes.directions @ theta)
     pull = before.pull + (relative * update.innovation) @ modes.directions
     theta, cov = _learned(modes, before, information, pull)
-    score = update.innovation / update.variance
-    score -= relative * (modes.directions @ theta)
-    return Static(g, gamma, pull, information, theta, cov, score, modes.directions @ (theta - before.theta))
+    score, constant = update.innovation / update.variance, modes.directions @ theta
+    score -= relative * constant
+    return Static(g, gamma, pull, information, theta, cov, score, constant)
 
 
 def _learned(modes: Modes, before: Static, information: Floats, pull: Floats) -> tuple[Floats, Floats]:
@@ -171,11 +173,14 @@ def of_busbar(modes: Modes, now: Static) -> Floats:
 
 
 def restored(modes: Modes, now: Static) -> Static:
-    """The same with the pull that belongs to theta: the modal filter goes on with it.
+    """The same with the pull and the constant errors that belong to theta: the modal filter goes on with it.
 
     Parameters
     ----------
     modes, now
         The modes, and the information so far.
     """
-    return replace(now, pull=_precision_times(modes, now.information, now.theta)) if modes.sign.size else now
+    if not modes.sign.size:
+        return now
+    pull = _precision_times(modes, now.information, now.theta)
+    return replace(now, pull=pull, constant=modes.directions @ now.theta)

@@ -207,7 +207,7 @@ def offsets(core: Core, state: CoreState, m: Floats) -> Floats:
     mean = w + b
     if made.sign.size:
         g_w, g_b = state.static.signature
-        mean += (1.0 - g_w - g_b) * (made.directions @ state.static.theta)
+        mean += (1.0 - g_w - g_b) * state.static.constant
     return np.asarray(m - made.back @ mean)
 
 
