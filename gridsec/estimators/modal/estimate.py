@@ -56,12 +56,12 @@ class Estimator:
     ----------
     of_w, of_b, of_e : (n, t)
         Regression of the error of the model at each place on w, b and e.
-    of_modes : (n, t)
-        Covariance h of the loads at each place with the modes.
+    of_parts : (n, t + k)
+        Covariance h of the loads at each place with the modes, and L.
     by_w : (t,)
         ``of_w = h diag(by_w)``.
-    left, right : (n, k), (k, 2 t)
-        Factors of ``(of_b, of_e)``, of a few directions: the busbar's phases.
+    right : (k, 2 t)
+        R of ``(of_b, of_e) = L R``, of a few directions: the busbar's phases.
     rest : (n,)
         Variance that no reading takes away, squared pu^2.
     rest_w : (n,)
@@ -71,9 +71,8 @@ class Estimator:
     of_w: Floats = field(repr=False)
     of_b: Floats = field(repr=False)
     of_e: Floats = field(repr=False)
-    of_modes: Floats = field(repr=False)
+    of_parts: Floats = field(repr=False)
     by_w: Floats = field(repr=False)
-    left: Floats = field(repr=False)
     right: Floats = field(repr=False)
     rest: Floats
     rest_w: Floats
@@ -127,9 +126,8 @@ def estimator(modes: Modes) -> Estimator:
         of_w=ratio,
         of_b=of_b,
         of_e=by_e,
-        of_modes=np.ascontiguousarray(h),
+        of_parts=np.hstack([h, left]),
         by_w=by_w,
-        left=left,
         right=right,
         rest=np.maximum(rest, 0.0),
         rest_w=np.maximum(rest_w, 0.0),
@@ -140,7 +138,7 @@ def _factors(matrix: Floats) -> tuple[Floats, Floats]:
     """Factors (n, k) and (k, m) of a matrix of rank k, to rounding."""
     left, size, right = np.linalg.svd(matrix, full_matrices=False)
     k = int(np.count_nonzero(size > ROUNDING * size.max(initial=0.0)))
-    return np.ascontiguousarray(left[:, :k] * size[:k]), np.ascontiguousarray(right[:k])
+    return left[:, :k] * size[:k], np.ascontiguousarray(right[:k])
 
 
 def honest(
@@ -179,9 +177,7 @@ def honest(
 
 def _mean(made: Estimator, w: Floats, b: Floats, e: Floats) -> Floats:
     """Regression of all places on w, b and e, (n,)."""
-    out = made.of_modes @ (made.by_w * w)
-    out += made.left @ (made.right @ np.concatenate([b, e]))
-    return out
+    return made.of_parts @ np.concatenate([made.by_w * w, made.right @ np.concatenate([b, e])])
 
 
 def _variance(modes: Modes, made: Estimator, cov: Floats, static: Static, more: Floats) -> Floats:

@@ -522,7 +522,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         frame=tick.measured.frame,
         seen=seen,
         named=named,
-        unread=np.zeros_like(seen) if tick.unknown is None else tick.unknown.unchecked,
+        unread=np.zeros(seen.size, dtype=np.bool_) if tick.unknown is None else tick.unknown.unchecked,
         jumps=tick.held > 0,
         beyond=beyond,
         evidence=evidence,
@@ -629,15 +629,14 @@ def _busbar(
 def _estimate(
     design: ModalDesign, state: ModalState, tick: _Tick, sure: Bools
 ) -> tuple[Estimate, Callable[[], Floats]]:
-    """Voltages by the model and the core, with standard deviation and bound; the core's variance, (n,).
+    """Voltages by the model and the core, with standard deviation and bound, and the variance, (n,).
 
     sure: (p,) meters with a reading that bounds a voltage.
     """
     front, kernel, measured = design.front, design.core, tick.measured
     plant, now = front.plant, state.front
     errors = core.estimate(kernel, state.core, state.suspicion)
-    mean, spread = errors.mean, Spread(errors)
-    whole = state.core.filter.full
+    mean, whole, more = errors.mean, state.core.filter.full, None
     if tick.unknown is not None and whole is not None:
         u, read = tick.m - whole.mean[0] - whole.mean[1], whole.seen
         if state.suspicion is not None:
@@ -645,29 +644,29 @@ def _estimate(
             plain = core.estimate(kernel, state.core)
             u = u - (mean - plain.mean)[front.prior.meters]
             read = read & ~verdict.accused(kernel, state.suspicion)
-        more = doubts.estimated(kernel.modes, tick.unknown, u, read)
-        mean, spread = mean + more[0], Spread(errors, more[1])
+        off, more = doubts.estimated(kernel.modes, tick.unknown, u, read)
+        mean = mean + off
     v2_bus, first = tick.predicted.v2_bus + mean, plant.feeder.busbar_places()
-    metered = all_of(np.asarray(measured.busbar_metered))
-    v2_bus[first] = (
-        measured.v0_squared
-        if metered
-        else np.where(measured.busbar_metered, measured.v0_squared, v2_bus[first])
-    )
+    metered, least = measured.busbar_metered, front.busbar**2
+    if metered is True or all_of(np.asarray(metered)):
+        v2_bus[first] = measured.v0_squared
+    else:
+        v2_bus[first] = np.where(metered, measured.v0_squared, v2_bus[first])
+        least = np.where(metered, least, 0.0)
+    spread = Spread(errors, 0.0 if more is None else more, first, least)
     powers = tick.predicted.powers
     inputs = BoundInputs(
         plant=plant,
         powers=powers if powers.trusted is now.trust.trusted else changed(powers, trusted=now.trust.trusted),
         injected=tick.predicted.injection_error.error,
         model=tick.predicted.v2_bus[plant.feeder.bus],
-        busbar=measured.busbar_metered,
+        busbar=metered,
         y=measured.y,
         trusted=sure,
         checked=partial(checked, front, measured.frame),
         sigmas=front.sigmas[0],
     )
-    least = changed(spread, places=first, least=np.where(measured.busbar_metered, front.busbar**2, 0.0))
-    return Reconstructed.later(inputs, measured.frame.t, v2_bus, least, tick.predicted.x), spread
+    return Reconstructed.later(inputs, measured.frame.t, v2_bus, spread, tick.predicted.x), spread
 
 
 def own_errors(design: ModalDesign, state: CoreState) -> Floats:

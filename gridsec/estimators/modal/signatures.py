@@ -176,15 +176,18 @@ def follow(
     np.multiply(onsets.signature[1], rho_b, out=g[1])
     gamma = level[:, None] - g[0]
     gamma -= g[1]
-    weighed = gamma / update.variance
+    lost, busbar = _lost(modes, onsets, update, gamma), _busbar(modes, onsets, update, static, gamma)
     score = gamma * (static.score + static.gamma * static.constant / update.variance)
     score += onsets.score
-    information = weighed * gamma
-    lost, busbar = _lost(modes, onsets, update, gamma), _busbar(modes, onsets, update, static, gamma)
-    information += onsets.information
+    weighed = gamma / update.variance
     cross = weighed * static.gamma
     cross += onsets.cross
-    g += (update.gain if update.slower is None else update.slower)[:, None, :] * gamma
+    # Products take the place of arrays that are not needed any more: new ones do not stay in the cache.
+    information = np.multiply(weighed, gamma, out=weighed)
+    information += onsets.information
+    gain = update.gain if update.slower is None else update.slower
+    g[0] += gain[0] * gamma
+    g[1] += np.multiply(gain[1], gamma, out=gamma)
     for row in ended:
         g[:, row] = score[row] = information[row] = cross[row] = 0.0
         if lost is not None:

@@ -104,7 +104,7 @@ def follow(modes: Modes, before: Static, update: Update) -> Static:
         score = update.innovation / update.variance if update.score is None else update.score
         return changed(before, score=score)
     rho, rho_b = update.decay
-    g = before.signature * np.array([[rho], [rho_b]])
+    g = before.signature * np.array((rho, rho_b))[:, None]
     gamma = 1.0 - g[0] - g[1]
     g += update.gain * gamma
     relative = gamma / update.variance

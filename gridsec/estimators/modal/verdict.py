@@ -96,9 +96,9 @@ def meter_evidence(  # noqa: PLR0917  # the core, one tick, and one limit
     made, test, (m, seen), update = core.modes, state.detector, now, state.update
     row = _row(state, evidence, suspicion)
     one = signatures.scores(made, test.onsets, state.static, np.array([row]))
-    tested, enough = np.zeros_like(seen), 2.0 * core.limit / widest**2
+    tested, enough = np.zeros(seen.size, dtype=np.bool_), 2.0 * core.limit / widest**2
     if update is not None:
-        least = test.precision or detector.precision(made, None, update)
+        least = detector.precision(made, None, update) if test.precision is None else test.precision
         tested = seen & (least.least >= enough)
         if np.count_nonzero(tested) < np.count_nonzero(seen):
             tested = seen & (least.exact(made, update) >= enough)
@@ -226,7 +226,7 @@ def _row(state: CoreState, evidence: Evidence, suspicion: Suspicion | None) -> i
         of_meters = np.where(onsets.used, evidence.by_row[0], -inf)
         if of_meters.max() > -inf:
             return int(of_meters.argmax())
-    return int(np.where(onsets.used & ~onsets.ramp, onsets.age, -1).argmax())
+    return int((onsets.age * ~onsets.ramp).argmax())
 
 
 # --- Explanations ---
@@ -415,7 +415,7 @@ def verdict(design: SequentialDesign, now: Inputs, estimate: Estimate) -> Findin
             names=design.names,
             max_attacked=max(1, min(design.max_attacked, live // 3)),
             live=tested,
-            suspected=np.zeros_like(now.named),
+            suspected=np.zeros(tested.size, dtype=np.bool_),
             named=now.named,
             wide=tested & ~(now.evidence.tested | now.unread),
             valid=True,
