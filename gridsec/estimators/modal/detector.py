@@ -388,13 +388,10 @@ def _thin(detector: Detector, capital: Floats, ratio: Floats) -> list[int]:
             ages.pop(at)
             beside = [ages[k - 1] / ages[k + 1] for k in range(1, len(ages) - 1)]
             # The neighbours are now at the places at - 1 and at.
-            near = order[max(at - 1, 0) : at + 1]
-            if near:
-                _hand_over(kinds, row, near)
+            _hand_over(kinds, row, order[max(at - 1, 0) : at + 1])
             gone.append(row)
     if gone:
         capital[:] = [each for each, _ in kinds]
-        capital[:, gone] = -inf
     return gone
 
 
@@ -404,10 +401,13 @@ _NO_EVIDENCE = Evidence(-inf, np.full((len(WEIGHTS), _STEPS + RAMP_ROWS + 2), -i
 def _hand_over(kinds: list[tuple[list[float], list[float]]], row: int, near: list[int]) -> None:
     """Move the capital of a row to the neighbour with the largest Lambda, kind by kind; M stays.
 
+    near: rows of the neighbours, at most 2.
     kinds: logarithms of capital and Lambda of every row, of each kind. The capitals are changed.
     """
     for capital, ratio in kinds:
-        to = max(near, key=ratio.__getitem__)
-        given, own = capital[row] + ratio[row] - ratio[to], capital[to]
-        larger, less = (own, given) if own > given else (given, own)
-        capital[to] = larger + log1p(exp(less - larger)) if larger > -inf else larger
+        if near:
+            to = near[-1] if ratio[near[-1]] > ratio[near[0]] else near[0]
+            given, own = capital[row] + ratio[row] - ratio[to], capital[to]
+            larger, less = (own, given) if own > given else (given, own)
+            capital[to] = larger + log1p(exp(less - larger)) if larger > -inf else larger
+        capital[row] = -inf

@@ -162,17 +162,16 @@ def honest(
     loads
         Variance of the loads' errors that vary, in those of the model, 1.
     """
-    more = (loads - 1.0) * made.rest_w
     if state.full is not None:
         w, b = state.full.mean @ modes.U
         mean = _mean(made, w, b, static.score)
-        return Estimated(mean, partial(_full_variance, modes, made, state.full, more))
+        return Estimated(mean, partial(_full_variance, modes, made, state.full, loads))
     w, b = state.mean
     if modes.sign.size:
         g_w, g_b = static.signature
         w, b = w - g_w * static.constant, b + (1.0 - g_b) * static.constant
     mean = _mean(made, w, b, static.score)
-    return Estimated(mean, partial(_variance, modes, made, state.cov, static, more))
+    return Estimated(mean, partial(_variance, modes, made, state.cov, static, loads))
 
 
 def _mean(made: Estimator, w: Floats, b: Floats, e: Floats) -> Floats:
@@ -180,22 +179,23 @@ def _mean(made: Estimator, w: Floats, b: Floats, e: Floats) -> Floats:
     return made.of_parts @ np.concatenate([made.by_w * w, made.right @ np.concatenate([b, e])])
 
 
-def _variance(modes: Modes, made: Estimator, cov: Floats, static: Static, more: Floats) -> Floats:
+def _variance(modes: Modes, made: Estimator, cov: Floats, static: Static, loads: float) -> Floats:
     """Variance by the covariance of the modes (3, t) and of the directions, (n,)."""
     moved = _theta(modes, made, static)
     by_w, by_b = made.of_w - made.of_e, made.of_b - made.of_e
     out = (by_w * by_w) @ cov[0] + (by_b * by_b) @ cov[2] + 2.0 * ((by_w * by_b) @ cov[1])
-    out += made.rest + more + ((moved @ static.cov) * moved).sum(axis=1)
+    out += made.rest + (loads - 1.0) * made.rest_w + ((moved @ static.cov) * moved).sum(axis=1)
     return np.asarray(np.maximum(out, 0.0))
 
 
-def _full_variance(modes: Modes, made: Estimator, full: Full, more: Floats) -> Floats:
+def _full_variance(modes: Modes, made: Estimator, full: Full, loads: float) -> Floats:
     """Variance by the full covariance, (n,): the flicker is seen by the members with a reading only."""
     model, by_e = modes.model, _flicker(modes, full)
     read = ((by_e @ model.phases(modes.at)) * model.busbar_of).sum(axis=1)
     unread = (made.of_e**2).sum(axis=1) - model.flicker * read
     by = np.hstack([made.of_w @ modes.U.T - by_e, made.of_b @ modes.U.T - by_e])
-    out = ((by @ full.cov) * by).sum(axis=1) + made.rest + more + unread
+    more = (loads - 1.0) * made.rest_w + unread
+    out = ((by @ full.cov) * by).sum(axis=1) + made.rest + more
     return np.asarray(np.maximum(out, 0.0))
 
 
