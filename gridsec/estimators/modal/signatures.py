@@ -115,7 +115,7 @@ def empty(modes: Modes, steps: int, ramps: int = 0) -> Onsets:
 
 
 def single(onsets: Onsets, row: int) -> Onsets:
-    """One row by itself.
+    """One row by itself, as a copy: it does not keep the others in memory.
 
     Parameters
     ----------
@@ -124,16 +124,16 @@ def single(onsets: Onsets, row: int) -> Onsets:
     """
     at, lost, busbar = slice(row, row + 1), onsets.lost, onsets.busbar
     return Onsets(
-        onsets.age[at],
-        onsets.used[at],
-        onsets.ramp[at],
-        onsets.level[at],
-        onsets.signature[:, at],
-        onsets.score[at],
-        onsets.information[at],
-        onsets.cross[at],
-        None if lost is None else lost[at],
-        None if busbar is None else busbar[at],
+        onsets.age[at].copy(),
+        onsets.used[at].copy(),
+        onsets.ramp[at].copy(),
+        onsets.level[at].copy(),
+        onsets.signature[:, at].copy(),
+        onsets.score[at].copy(),
+        onsets.information[at].copy(),
+        onsets.cross[at].copy(),
+        None if lost is None else lost[at].copy(),
+        None if busbar is None else busbar[at].copy(),
     )
 
 

@@ -32,7 +32,8 @@ from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.costs import amounts
 from gridsec.estimators.modal.detector import SIZE, WEIGHTS, Evidence
 from gridsec.estimators.modal.search import DOUBT
-from gridsec.estimators.modal.signatures import Scores
+from gridsec.estimators.modal.signatures import Onsets
+from gridsec.estimators.modal.static import Static
 from gridsec.estimators.plant import NO_VOLTAGE
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.device_checks import probability
@@ -95,7 +96,6 @@ def meter_evidence(  # noqa: PLR0917  # the core, one tick, and one limit
     """
     made, test, (m, seen), update = core.modes, state.detector, now, state.update
     row = _row(state, evidence, suspicion)
-    one = signatures.scores(made, test.onsets, state.static, np.array([row]))
     tested, enough = np.zeros(seen.size, dtype=np.bool_), 2.0 * core.limit / widest**2
     if update is not None:
         least = detector.precision(made, None, update) if test.precision is None else test.precision
@@ -109,7 +109,8 @@ def meter_evidence(  # noqa: PLR0917  # the core, one tick, and one limit
     if any_of(state.masked.meters) and state.filter.full is not None:
         masked = (state.masked.meters, *deviations(core, state, m))
         tested = tested | (state.masked.meters & seen)
-    return MeterEvidence(tested, _Amounts(core, one, float(test.capital[0, row]), seen, masked))
+    one, capital = signatures.single(test.onsets, row), float(test.capital[0, row])
+    return MeterEvidence(tested, _Amounts(core, one, state.static, capital, seen, masked))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +118,8 @@ class _Amounts:
     """Score and threshold of every meter at one onset."""
 
     core: Core
-    one: Scores  # of the onset
+    one: Onsets  # the onset by itself
+    static: Static  # information about the directions
     capital: float  # its logarithm
     seen: Bools  # (p,) meters with a reading
     # masked meters, with the deviations of their readings from the filter and the standard deviations
@@ -125,7 +127,8 @@ class _Amounts:
 
     def __call__(self) -> tuple[Floats, Floats]:
         made = self.core.modes
-        y, F = (each[0] for each in self.one.of(made.U.T, made.squares.T))
+        now = signatures.scores(made, self.one, self.static)
+        y, F = (each[0] for each in now.of(made.U.T, made.squares.T))
         F = np.maximum(F, _TINY)
         part = log(WEIGHTS[0] / made.size) + self.capital
         gain = 2.0 * (self.core.limit - part) + np.log1p(SIZE**2 * F)
