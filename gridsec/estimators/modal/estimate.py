@@ -176,7 +176,8 @@ def honest(
 
 def _mean(made: Estimator, w: Floats, b: Floats, e: Floats) -> Floats:
     """Regression of all places on w, b and e, (n,)."""
-    return made.of_parts @ np.concatenate([made.by_w * w, made.right @ np.concatenate([b, e])])
+    parts = np.concatenate([made.by_w * w, made.right @ np.concatenate([b, e])])
+    return np.asarray(made.of_parts @ parts)
 
 
 def _variance(modes: Modes, made: Estimator, cov: Floats, static: Static, loads: float) -> Floats:

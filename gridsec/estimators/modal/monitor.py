@@ -647,8 +647,9 @@ def _estimate(
         off, more = doubts.estimated(kernel.modes, tick.unknown, u, read)
         mean = mean + off
     v2_bus, first = tick.predicted.v2_bus + mean, plant.feeder.busbar_places()
-    metered, least = measured.busbar_metered, front.busbar**2
-    if metered is True or all_of(np.asarray(metered)):
+    metered = measured.busbar_metered
+    least: Floats | float = front.busbar**2
+    if all_of(np.asarray(metered)):
         v2_bus[first] = measured.v0_squared
     else:
         v2_bus[first] = np.where(metered, measured.v0_squared, v2_bus[first])
