@@ -372,7 +372,9 @@ def _flows(sweep: _Sweep, p: Floats, q: Floats) -> Floats:
 
 def _drop(sweep: _Sweep, flows: Floats) -> Floats:
     """``r P + x Q`` of flows (…, 2, b + 1)."""
-    return np.asarray(np.einsum("...kb,kb->...b", flows, sweep.z))
+    out = flows[..., 0, :] * sweep.z[0]
+    out += flows[..., 1, :] * sweep.z[1]
+    return np.asarray(out)
 
 
 def _along_paths(sweep: _Sweep, values: Floats) -> Floats:

@@ -102,8 +102,8 @@ def means(made: Classes, modes: Modes, state: FilterState, static: Static) -> Fl
     if state.full is not None:
         return np.asarray(made.own @ state.full.mean[1])
     b = state.mean[1]
-    if static.theta.size:
-        b = b + (1.0 - static.signature[1]) * (modes.directions @ static.theta)
+    if modes.sign.size:
+        b = b + (1.0 - static.signature[1]) * static.constant
     return np.asarray(made.of_modes @ b)
 
 

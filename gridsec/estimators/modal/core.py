@@ -331,7 +331,7 @@ def step(  # noqa: PLR0917  # the state, and one tick
         if pinned and not suspected:
             suspected = replay.carried(made, state.detector.onsets, state.static, pinned)
         suspected = tuple(replay.follow(made, each, update.exact, update.gap) for each in suspected)
-    others = tuple(rivals.follow(each, t, m, seen, unknown, jump) for each in state.rivals)
+    others = tuple([rivals.follow(each, t, m, seen, unknown, jump) for each in state.rivals])
     if evidence.log_m >= core.limit and (not pinned or _elsewhere(evidence, pinned)):
         test = detector.pin(test, evidence.rows)
         last = replay.record(state.history, (after, known, test, ()), m, seen, unknown, jump)

@@ -40,7 +40,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import inf, log, sqrt
+from math import exp, inf, log, log1p, sqrt
 
 import numpy as np
 from scipy.linalg import lapack
@@ -239,7 +239,8 @@ def step(
         capital[:, begun[1]] = log(RAMPS * RAMP_EVERY)
     onsets = signatures.follow(modes, before.onsets, update, static, h, begun=begun, ended=ended)
     full, suspected = ticks <= EVERY or ticks % EVERY == 0, any_of(before.pinned)
-    least = precision(modes, before.precision, update)
+    # The variances fall: an old bound is too low to be of use.
+    least = precision(modes, None if full else before.precision, update)
     always = full or suspected or update.seen is not None or before.log_m >= alert
     if not (always or _stands_out(modes, update, static, least)):
         return Detector(onsets, capital, ticks, None, before.pinned, before.log_m, least), _NO_EVIDENCE
@@ -320,7 +321,7 @@ def log_lambda(y: Floats, F: Floats, s2: Floats) -> Floats:
     out = y * y
     out *= s2
     out /= more
-    out -= np.log(more)
+    out -= np.log(more, out=more)
     out *= 0.5
     return out
 
@@ -352,19 +353,21 @@ def omnibus(now: Scores, s2: float) -> Floats:
         peak = now.share.max(axis=1)
         count = now.share.mean(axis=1) / np.maximum(peak, _TINY)
         i, side = peak[:, None] * i, np.sqrt(peak)[:, None, None] * side
-    more = 1.0 + s2 * i
-    A = s2 / more
-    A *= now.score
-    out = np.einsum("kt,kt->k", A, now.score) - count * np.log(more).sum(axis=1)
+    more = s2 * i
+    more += 1.0
+    weight = s2 / more
+    A = weight * now.score
+    out = np.vecdot(A, now.score) - count * np.log(more, out=more).sum(axis=1)
     if not now.cov.size:
         return np.asarray(0.5 * out)
-    pull = np.einsum("krt,kt->kr", side, A)
-    inner = (side * (s2 / more)[:, None, :]) @ side.transpose(0, 2, 1)
     # det(I - N X'AX) and (N^-1 - X'AX)^-1 = (I - N X'AX)^-1 N.
-    rest = np.eye(len(now.cov)) - now.cov @ inner
     if len(now.cov) == 1:
-        one = rest[:, 0, 0]
-        return np.asarray(0.5 * (out + now.cov[0, 0] * pull[:, 0] ** 2 / one - np.log(one)))
+        along, n = side[:, 0], now.cov[0, 0]
+        pull, weight = np.vecdot(along, A), np.multiply(weight, along, out=weight)
+        one = 1.0 - n * np.vecdot(weight, along)
+        return np.asarray(0.5 * (out + n * pull * pull / one - np.log(one)))
+    pull = np.einsum("krt,kt->kr", side, A)
+    rest = np.eye(len(now.cov)) - now.cov @ ((side * weight[:, None, :]) @ side.transpose(0, 2, 1))
     gain = np.linalg.solve(rest, (pull @ now.cov.T)[..., None])[..., 0]
     return np.asarray(0.5 * (out + np.einsum("kr,kr->k", pull, gain) - np.linalg.slogdet(rest)[1]))
 
@@ -372,11 +375,11 @@ def omnibus(now: Scores, s2: float) -> Floats:
 def _thin(detector: Detector, capital: Floats, ratio: Floats) -> list[int]:
     """Rows to drop, so that those of the next ticks are free; `capital` is changed: it goes to neighbours."""
     onsets, gone = detector.onsets, list[int]()
+    age, kinds = onsets.age.tolist(), list(zip(capital.tolist(), ratio.tolist(), strict=True))
     usable = onsets.used & ~detector.pinned
-    for ramp, most in ((False, STEP_ROWS), (True, RAMP_ROWS)):
-        rows = np.flatnonzero(usable & (onsets.ramp == ramp))
-        order = rows[np.argsort(-onsets.age[rows], kind="stable")].tolist()
-        ages = onsets.age[order].tolist()
+    for rows, most in ((usable & ~onsets.ramp, STEP_ROWS), (usable & onsets.ramp, RAMP_ROWS)):
+        order = sorted(indices(rows).tolist(), key=lambda row: -age[row])
+        ages = [age[row] for row in order]
         # Ratio of the ages beside each onset but the first and the last.
         beside = [ages[k - 1] / ages[k + 1] for k in range(1, len(ages) - 1)]
         while len(order) > most or (ages and ages[0] > OLDEST):
@@ -385,20 +388,26 @@ def _thin(detector: Detector, capital: Floats, ratio: Floats) -> list[int]:
             ages.pop(at)
             beside = [ages[k - 1] / ages[k + 1] for k in range(1, len(ages) - 1)]
             # The neighbours are now at the places at - 1 and at.
-            _hand_over(capital, ratio, row, order[max(at - 1, 0) : at + 1])
+            _hand_over(kinds, row, order[max(at - 1, 0) : at + 1])
             gone.append(row)
-    capital[:, gone] = -inf
+    if gone:
+        capital[:] = [each for each, _ in kinds]
     return gone
 
 
-_KINDS = np.arange(len(WEIGHTS))
 _NO_EVIDENCE = Evidence(-inf, np.full((len(WEIGHTS), _STEPS + RAMP_ROWS + 2), -inf))
 
 
-def _hand_over(capital: Floats, ratio: Floats, row: int, near: list[int]) -> None:
-    """Move the capital of a row to the neighbour with the largest Lambda, kind by kind; M stays."""
-    if not near:
-        return
-    to = np.array(near)[ratio[:, near].argmax(axis=1)]
-    given = capital[:, row] + ratio[:, row] - ratio[_KINDS, to]
-    capital[_KINDS, to] = np.logaddexp(capital[_KINDS, to], given)
+def _hand_over(kinds: list[tuple[list[float], list[float]]], row: int, near: list[int]) -> None:
+    """Move the capital of a row to the neighbour with the largest Lambda, kind by kind; M stays.
+
+    near: rows of the neighbours, at most 2.
+    kinds: logarithms of capital and Lambda of every row, of each kind. The capitals are changed.
+    """
+    for capital, ratio in kinds:
+        if near:
+            to = near[-1] if ratio[near[-1]] > ratio[near[0]] else near[0]
+            given, own = capital[row] + ratio[row] - ratio[to], capital[to]
+            larger, less = (own, given) if own > given else (given, own)
+            capital[to] = larger + log1p(exp(less - larger)) if larger > -inf else larger
+        capital[row] = -inf

@@ -56,12 +56,12 @@ class Estimator:
     ----------
     of_w, of_b, of_e : (n, t)
         Regression of the error of the model at each place on w, b and e.
-    of_modes : (n, t)
-        Covariance h of the loads at each place with the modes.
+    of_parts : (n, t + k)
+        Covariance h of the loads at each place with the modes, and L.
     by_w : (t,)
         ``of_w = h diag(by_w)``.
-    left, right : (n, k), (k, 2 t)
-        Factors of ``(of_b, of_e)``, of a few directions: the busbar's phases.
+    right : (k, 2 t)
+        R of ``(of_b, of_e) = L R``, of a few directions: the busbar's phases.
     rest : (n,)
         Variance that no reading takes away, squared pu^2.
     rest_w : (n,)
@@ -71,9 +71,8 @@ class Estimator:
     of_w: Floats = field(repr=False)
     of_b: Floats = field(repr=False)
     of_e: Floats = field(repr=False)
-    of_modes: Floats = field(repr=False)
+    of_parts: Floats = field(repr=False)
     by_w: Floats = field(repr=False)
-    left: Floats = field(repr=False)
     right: Floats = field(repr=False)
     rest: Floats
     rest_w: Floats
@@ -127,9 +126,8 @@ def estimator(modes: Modes) -> Estimator:
         of_w=ratio,
         of_b=of_b,
         of_e=by_e,
-        of_modes=np.ascontiguousarray(h),
+        of_parts=np.hstack([h, left]),
         by_w=by_w,
-        left=left,
         right=right,
         rest=np.maximum(rest, 0.0),
         rest_w=np.maximum(rest_w, 0.0),
@@ -140,7 +138,7 @@ def _factors(matrix: Floats) -> tuple[Floats, Floats]:
     """Factors (n, k) and (k, m) of a matrix of rank k, to rounding."""
     left, size, right = np.linalg.svd(matrix, full_matrices=False)
     k = int(np.count_nonzero(size > ROUNDING * size.max(initial=0.0)))
-    return np.ascontiguousarray(left[:, :k] * size[:k]), np.ascontiguousarray(right[:k])
+    return left[:, :k] * size[:k], np.ascontiguousarray(right[:k])
 
 
 def honest(
@@ -164,42 +162,41 @@ def honest(
     loads
         Variance of the loads' errors that vary, in those of the model, 1.
     """
-    more = (loads - 1.0) * made.rest_w
     if state.full is not None:
         w, b = state.full.mean @ modes.U
         mean = _mean(made, w, b, static.score)
-        return Estimated(mean, partial(_full_variance, modes, made, state.full, more))
+        return Estimated(mean, partial(_full_variance, modes, made, state.full, loads))
     w, b = state.mean
     if modes.sign.size:
-        (g_w, g_b), known = static.signature, modes.directions @ static.theta
-        w, b = w - g_w * known, b + (1.0 - g_b) * known
+        g_w, g_b = static.signature
+        w, b = w - g_w * static.constant, b + (1.0 - g_b) * static.constant
     mean = _mean(made, w, b, static.score)
-    return Estimated(mean, partial(_variance, modes, made, state.cov, static, more))
+    return Estimated(mean, partial(_variance, modes, made, state.cov, static, loads))
 
 
 def _mean(made: Estimator, w: Floats, b: Floats, e: Floats) -> Floats:
     """Regression of all places on w, b and e, (n,)."""
-    out = made.of_modes @ (made.by_w * w)
-    out += made.left @ (made.right @ np.concatenate([b, e]))
-    return out
+    parts = np.concatenate([made.by_w * w, made.right @ np.concatenate([b, e])])
+    return np.asarray(made.of_parts @ parts)
 
 
-def _variance(modes: Modes, made: Estimator, cov: Floats, static: Static, more: Floats) -> Floats:
+def _variance(modes: Modes, made: Estimator, cov: Floats, static: Static, loads: float) -> Floats:
     """Variance by the covariance of the modes (3, t) and of the directions, (n,)."""
     moved = _theta(modes, made, static)
     by_w, by_b = made.of_w - made.of_e, made.of_b - made.of_e
     out = (by_w * by_w) @ cov[0] + (by_b * by_b) @ cov[2] + 2.0 * ((by_w * by_b) @ cov[1])
-    out += made.rest + more + ((moved @ static.cov) * moved).sum(axis=1)
+    out += made.rest + (loads - 1.0) * made.rest_w + ((moved @ static.cov) * moved).sum(axis=1)
     return np.asarray(np.maximum(out, 0.0))
 
 
-def _full_variance(modes: Modes, made: Estimator, full: Full, more: Floats) -> Floats:
+def _full_variance(modes: Modes, made: Estimator, full: Full, loads: float) -> Floats:
     """Variance by the full covariance, (n,): the flicker is seen by the members with a reading only."""
     model, by_e = modes.model, _flicker(modes, full)
     read = ((by_e @ model.phases(modes.at)) * model.busbar_of).sum(axis=1)
     unread = (made.of_e**2).sum(axis=1) - model.flicker * read
     by = np.hstack([made.of_w @ modes.U.T - by_e, made.of_b @ modes.U.T - by_e])
-    out = ((by @ full.cov) * by).sum(axis=1) + made.rest + more + unread
+    more = (loads - 1.0) * made.rest_w + unread
+    out = ((by @ full.cov) * by).sum(axis=1) + made.rest + more
     return np.asarray(np.maximum(out, 0.0))
 
 

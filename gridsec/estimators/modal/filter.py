@@ -240,15 +240,17 @@ def step(  # noqa: PLR0917  # the state, and one tick
     rho, rho_b = gap.decay(modes)
     cov, shared, v = predicted(modes, state.cov, rho, rho_b, jump)
     whole = seen is None or all_of(seen)
-    gain, mean, nu = shared / v, state.mean, np.zeros(v.size)
+    gain, mean = shared / v, state.mean
     if state.full is None:
         if not whole:
             raise InputInvalid([Problem("missing", "missing readings need the full covariance")])
-        mean = mean * np.array([[rho], [rho_b]])
+        mean = mean * np.array((rho, rho_b))[:, None]
         nu = m @ modes.U
         nu -= mean[0]
         nu -= mean[1]
         mean += gain * nu
+    else:
+        nu = np.zeros(v.size)
     cov[:2] -= gain * shared[0]
     cov[2] -= gain[1] * shared[1]
     seen = None if whole else seen
@@ -269,10 +271,12 @@ def predicted(
     rho, rho_b, jump
         Factors and jump of the interval.
     """
-    cov = cov * np.array([[rho * rho], [rho * rho_b], [rho_b * rho_b]])
+    cov = cov * np.array((rho * rho, rho * rho_b, rho_b * rho_b))[:, None]
     cov[0] += (1.0 - rho * rho) * modes.varying
     if jump:
         cov[0] += jump * modes.loads
     cov[2] += (1.0 - rho_b * rho_b) * modes.lasting
     shared = cov[:2] + cov[1:]
-    return cov, shared, shared[0] + shared[1] + 1.0
+    v = shared[0] + shared[1]
+    v += 1.0
+    return cov, shared, v

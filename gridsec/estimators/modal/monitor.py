@@ -112,11 +112,14 @@ class ModalDesign:
         The statistical core.
     reach : (2 N,)
         Largest effect of each power on a meter, as in `doubts.reach`.
+    negligible : (p,)
+        Largest transient of the observer beside the error at which a reading stands out, squared pu.
     """
 
     front: SequentialDesign
     core: Core
     reach: Floats = field(repr=False)
+    negligible: Floats = field(repr=False)
 
     @property
     def plant(self) -> Plant:
@@ -159,7 +162,9 @@ def design(
     `gridsec.estimators.sequential.design.design`, and its errors.
     """
     front = front_design(plant, doubt=doubt, step_s=step_s, options=options, max_attacked=max_attacked)
-    return ModalDesign(front, core.design(front, most), doubts.reach(front))
+    made = core.design(front, most)
+    stands_out = np.maximum(front.allowed, drive.JUMP * made.modes.noise_std)
+    return ModalDesign(front, made, doubts.reach(front), front.options.settled * stands_out)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -465,10 +470,13 @@ def _suspected_busbar(front: SequentialDesign, trust: BusbarTrust, named: Bools)
 def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[ModalState, Estimate, Verdict]:
     """State, estimate and verdict after a tick."""
     front, kernel, now = design.front, state.core, state.front
-    named, seen = kernel.masked.meters, tick.measured.available
+    named, seen, beyond = kernel.masked.meters, tick.measured.available, kernel.exceeding
     suspected = any_of(kernel.detector.pinned)
+    doubtful = suspected or any_of(beyond)
     trust = _trust(design, now, named, state.suspicion)
-    estimate, spread = _estimate(design, state if trust is now else changed(state, front=trust), tick)
+    # While the readings disagree and no search has settled it, no reading bounds a voltage.
+    sure = np.zeros_like(seen) if doubtful else trust.trust.trusted & seen
+    estimate, spread = _estimate(design, state if trust is now else changed(state, front=trust), tick, sure)
     busbar = _busbar(design, now, tick, estimate, spread)
     evidence = verdict.meter_evidence(
         design.core, kernel, tick.evidence, (tick.m, seen), front.options.widest, state.suspicion
@@ -482,14 +490,14 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         frame=tick.measured.frame,
         seen=seen,
         named=named,
-        unread=np.zeros_like(seen) if tick.unknown is None else tick.unknown.unchecked,
+        unread=np.zeros(seen.size, dtype=np.bool_) if tick.unknown is None else tick.unknown.unchecked,
         jumps=tick.held > 0,
-        beyond=kernel.exceeding,
+        beyond=beyond,
         evidence=evidence,
         suspected=suspected,
         explanations=rivals,
         suspicion=state.suspicion,
-        settled=_settled(design, tick.predicted),
+        settled=all_of(tick.predicted.transient <= design.negligible),
         inverters=inverters,
         busbar=busbar.named,
         metered=np.atleast_1d(np.asarray(tick.measured.busbar_metered)),
@@ -511,7 +519,6 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         busbar=given.busbar,
         busbar_attack=given.busbar_off,
     )
-    doubtful = _doubtful(kernel)
     calm = not (doubtful or any_of(named) or any_of(~busbar.trusted))
     kept = (
         record.kept(design.core.modes, state.kept, kernel.filter, kernel.static, now.ticks) if calm else None
@@ -567,12 +574,6 @@ def _trust(
     )
 
 
-def _settled(design: ModalDesign, predicted: Prediction) -> bool:
-    """The observer's initial transient is a small part of the error at which a reading stands out."""
-    seen = np.maximum(design.front.allowed, drive.JUMP * design.core.modes.noise_std)
-    return all_of(predicted.transient <= design.options.settled * seen)
-
-
 def _busbar(
     design: ModalDesign, now: SequentialState, tick: _Tick, estimate: Estimate, spread: Callable[[], Floats]
 ) -> BusbarTrust:
@@ -587,13 +588,17 @@ def _busbar(
     return track_busbar(front, now.busbar, measured.busbar_reading, there, v0_squared, variance, allowed)
 
 
-def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Estimate, Callable[[], Floats]]:
-    """Voltages by the model and the core, with standard deviation and bound; the core's variance, (n,)."""
+def _estimate(
+    design: ModalDesign, state: ModalState, tick: _Tick, sure: Bools
+) -> tuple[Estimate, Callable[[], Floats]]:
+    """Voltages by the model and the core, with standard deviation and bound, and the variance, (n,).
+
+    sure: (p,) meters with a reading that bounds a voltage.
+    """
     front, kernel, measured = design.front, design.core, tick.measured
     plant, now = front.plant, state.front
     errors = core.estimate(kernel, state.core, state.suspicion)
-    mean, spread = errors.mean, Spread(errors)
-    whole = state.core.filter.full
+    mean, whole, more = errors.mean, state.core.filter.full, None
     if tick.unknown is not None and whole is not None:
         u, read = tick.m - whole.mean[0] - whole.mean[1], whole.seen
         if state.suspicion is not None:
@@ -601,31 +606,30 @@ def _estimate(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Esti
             plain = core.estimate(kernel, state.core)
             u = u - (mean - plain.mean)[front.prior.meters]
             read = read & ~verdict.accused(kernel, state.suspicion)
-        more = doubts.estimated(kernel.modes, tick.unknown, u, read)
-        mean, spread = mean + more[0], Spread(errors, more[1])
+        off, more = doubts.estimated(kernel.modes, tick.unknown, u, read)
+        mean = mean + off
     v2_bus, first = tick.predicted.v2_bus + mean, plant.feeder.busbar_places()
-    metered = all_of(np.asarray(measured.busbar_metered))
-    v2_bus[first] = (
-        measured.v0_squared
-        if metered
-        else np.where(measured.busbar_metered, measured.v0_squared, v2_bus[first])
-    )
-    # While the readings disagree and no search has settled it, no reading bounds a voltage.
-    sure = now.trust.trusted & measured.available & (not _doubtful(state.core))
+    metered = measured.busbar_metered
+    least: Floats | float = front.busbar**2
+    if all_of(np.asarray(metered)):
+        v2_bus[first] = measured.v0_squared
+    else:
+        v2_bus[first] = np.where(metered, measured.v0_squared, v2_bus[first])
+        least = np.where(metered, least, 0.0)
+    spread = Spread(errors, 0.0 if more is None else more, first, least)
     powers = tick.predicted.powers
     inputs = BoundInputs(
         plant=plant,
         powers=powers if powers.trusted is now.trust.trusted else changed(powers, trusted=now.trust.trusted),
         injected=tick.predicted.injection_error.error,
         model=tick.predicted.v2_bus[plant.feeder.bus],
-        busbar=measured.busbar_metered,
+        busbar=metered,
         y=measured.y,
         trusted=sure,
         checked=partial(checked, front, measured.frame),
         sigmas=front.sigmas[0],
     )
-    least = changed(spread, places=first, least=np.where(measured.busbar_metered, front.busbar**2, 0.0))
-    return Reconstructed.later(inputs, measured.frame.t, v2_bus, least, tick.predicted.x), spread
+    return Reconstructed.later(inputs, measured.frame.t, v2_bus, spread, tick.predicted.x), spread
 
 
 def own_errors(design: ModalDesign, state: CoreState) -> Floats:

@@ -12,11 +12,11 @@ with the gain and variance (k, v) of `gridsec.estimators.modal.filter` and gamma
 has the signature ``(gamma - gamma_0 Gamma N Gamma' c) W``, N and c those before the tick. With s, the score
 of the exact innovation,
 
-    Y += gamma s - c * Gamma (theta_t - theta_(t-1)),   y = W' Y
+    a += gamma (s + gamma_0 Gamma theta / v),   Y = a - c * Gamma theta,   y = W' Y
     I = W' (diag(i) - diag(c) Gamma N Gamma' diag(c)) W
 
 and ``exp(y' f - f' I f / 2)`` is the likelihood ratio of the fault against none, given all readings so far.
-``Y = a - c * Gamma theta`` with ``a = sum gamma nu / v``.
+With complete readings a grows by ``gamma nu / v``.
 
 With many directions (more than `static.FEW`) I takes only those of the busbar into account. It is then too
 large by a positive semidefinite matrix, and mixtures of likelihood ratios are too small: their expectation
@@ -55,9 +55,6 @@ RAMP_S = 600.0
 """Time in which a unit ramp reaches 1, s: the time scale of the loads."""
 
 
-_ALL = slice(None)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Onsets:
     """Rows of onsets, each a step or a ramp. k rows, t modes. A row that is not in use is zero.
@@ -73,7 +70,7 @@ class Onsets:
     signature : (2, k, t)
         g of w and of b, after the last update.
     score, information, cross : (k, t)
-        Score of the exact innovation, i and c.
+        a, i and c.
     lost : (k, t) or None
         Part of i at each member that was not read; None where nothing is missing since the filter is modal.
     busbar : (k, b) or None
@@ -118,7 +115,7 @@ def empty(modes: Modes, steps: int, ramps: int = 0) -> Onsets:
 
 
 def single(onsets: Onsets, row: int) -> Onsets:
-    """One row by itself.
+    """One row by itself, as a copy: it does not keep the others in memory.
 
     Parameters
     ----------
@@ -127,16 +124,16 @@ def single(onsets: Onsets, row: int) -> Onsets:
     """
     at, lost, busbar = slice(row, row + 1), onsets.lost, onsets.busbar
     return Onsets(
-        onsets.age[at],
-        onsets.used[at],
-        onsets.ramp[at],
-        onsets.level[at],
-        onsets.signature[:, at],
-        onsets.score[at],
-        onsets.information[at],
-        onsets.cross[at],
-        None if lost is None else lost[at],
-        None if busbar is None else busbar[at],
+        onsets.age[at].copy(),
+        onsets.used[at].copy(),
+        onsets.ramp[at].copy(),
+        onsets.level[at].copy(),
+        onsets.signature[:, at].copy(),
+        onsets.score[at].copy(),
+        onsets.information[at].copy(),
+        onsets.cross[at].copy(),
+        None if lost is None else lost[at].copy(),
+        None if busbar is None else busbar[at].copy(),
     )
 
 
@@ -179,16 +176,18 @@ def follow(
     np.multiply(onsets.signature[1], rho_b, out=g[1])
     gamma = level[:, None] - g[0]
     gamma -= g[1]
-    weighed = gamma / update.variance
-    score = gamma * static.score
-    score -= onsets.cross * static.moved
-    score += onsets.score
-    information = weighed * gamma
     lost, busbar = _lost(modes, onsets, update, gamma), _busbar(modes, onsets, update, static, gamma)
-    information += onsets.information
+    score = gamma * (static.score + static.gamma * static.constant / update.variance)
+    score += onsets.score
+    weighed = gamma / update.variance
     cross = weighed * static.gamma
     cross += onsets.cross
-    g += (update.gain if update.slower is None else update.slower)[:, None, :] * gamma
+    # Products take the place of arrays that are not needed any more: new ones do not stay in the cache.
+    information = np.multiply(weighed, gamma, out=weighed)
+    information += onsets.information
+    gain = update.gain if update.slower is None else update.slower
+    g[0] += gain[0] * gamma
+    g[1] += np.multiply(gain[1], gamma, out=gamma)
     for row in ended:
         g[:, row] = score[row] = information[row] = cross[row] = 0.0
         if lost is not None:
@@ -276,18 +275,23 @@ class Scores:
         W, squares : (t, q)
             The columns in the modes, those of the members first, and their squares.
         """
-        F = self.information @ squares
+        (k, t), F = self.score.shape, self.information @ squares
+        # One product in place of two: the columns are read once.
+        every = np.concatenate([self.score, self.side.reshape(-1, t)]) @ W
+        y, side = every[:k], every[k:]
         if self.cov.size == 1:
-            F -= self.cov[0, 0] * (self.side[:, 0] @ W) ** 2
+            side *= side
+            side *= self.cov[0, 0]
+            F -= side
         elif self.cov.size:
-            side = self.side @ W
+            side = side.reshape(k, len(self.cov), -1)
             F -= np.einsum("krq,rs,ksq->kq", side, self.cov, side)
         if self.share is not None:
             F[:, : self.share.shape[1]] *= self.share
-        return self.score @ W, F
+        return y, F
 
 
-def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _ALL) -> Scores:
+def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | None = None) -> Scores:
     """Integrate the directions out.
 
     Parameters
@@ -295,16 +299,17 @@ def scores(modes: Modes, onsets: Onsets, static: Static, rows: Ints | slice = _A
     modes, onsets, static
         The modes, and the information so far.
     rows : (k,)
-        Rows to work on; all by default.
+        Rows to work on; None: all.
     """
-    r = modes.sign.size
-    score, information = onsets.score[rows], onsets.information[rows]
+    r, rows = modes.sign.size, np.arange(onsets.age.size) if rows is None else rows
+    score, information = onsets.score.take(rows, axis=0), onsets.information.take(rows, axis=0)
     share = None if onsets.lost is None else _share(modes, information, onsets.lost[rows])
     busbar = None if onsets.busbar is None else onsets.busbar[rows]
     if not r:
         none = np.zeros((len(score), 0, modes.size)), np.zeros((0, 0))
         return Scores(score, information, *none, share, busbar)
-    cross, G, cov = onsets.cross[rows], modes.directions, static.cov
+    cross, G, cov = onsets.cross.take(rows, axis=0), modes.directions, static.cov
+    score -= cross * static.constant
     if r > FEW:
         G, cov = G[:, : modes.busbar], of_busbar(modes, static)
     return Scores(score, information, cross[:, None, :] * G.T, cov, share, busbar)
@@ -353,6 +358,7 @@ def joint(modes: Modes, onsets: Onsets, static: Static, row: int) -> Joint:
     score, g, level = onsets.score[row], onsets.signature[:, row], float(onsets.level[row])
     information, shift = np.diag(onsets.information[row]), np.stack([np.diag(each) for each in g])
     if modes.sign.size:
+        score = score - onsets.cross[row] * static.constant
         side = onsets.cross[row][:, None] * modes.directions
         turn = current(modes, static).cov @ side.T
         information -= side @ turn

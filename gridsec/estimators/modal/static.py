@@ -59,8 +59,10 @@ class Static:
         Posterior mean of the amounts.
     cov : (r, r)
         N of the tick at which it was computed last.
-    score, moved : (t,)
-        Of the last tick: ``V^-1`` times the exact innovation, and change of ``Gamma theta``, in the modes.
+    score : (t,)
+        ``V^-1`` times the exact innovation of the last tick, in the modes.
+    constant : (t,)
+        ``Gamma theta``.
     """
 
     signature: Floats
@@ -70,7 +72,7 @@ class Static:
     theta: Floats
     cov: Floats = field(repr=False)
     score: Floats
-    moved: Floats
+    constant: Floats
 
 
 def start(modes: Modes) -> Static:
@@ -102,45 +104,46 @@ def follow(modes: Modes, before: Static, update: Update) -> Static:
         score = update.innovation / update.variance if update.score is None else update.score
         return changed(before, score=score)
     rho, rho_b = update.decay
-    g = before.signature * np.array([[rho], [rho_b]])
+    g = before.signature * np.array((rho, rho_b))[:, None]
     gamma = 1.0 - g[0] - g[1]
     g += update.gain * gamma
-    information = before.information + gamma * gamma / update.variance
-    now = changed(before, information=information)
+    relative = gamma / update.variance
+    information = before.information + relative * gamma
     if update.score is not None:
         # The innovation is exact without theta, which says only how a fault would have been learned.
+        now = changed(before, information=information)
         cov, turn = before.cov, np.zeros(modes.sign.size)
         if modes.sign.size <= FEW:
             cov, turn = current(modes, now).cov, cov @ ((gamma * update.score) @ modes.directions)
         elif modes.busbar:
             G = modes.directions[:, : modes.busbar]
             turn[: modes.busbar] = of_busbar(modes, now) @ ((gamma * update.score) @ G)
-        moved, theta = modes.directions @ turn, before.theta + turn
-        return Static(g, gamma, before.pull, information, theta, cov, update.score, moved)
-    weighed = update.innovation / update.variance
-    pull = before.pull + (gamma * weighed) @ modes.directions
-    theta, cov = _learned(modes, now, pull)
-    score = weighed - gamma * (modes.directions @ theta) / update.variance
-    return Static(g, gamma, pull, information, theta, cov, score, modes.directions @ (theta - before.theta))
+        theta = before.theta + turn
+        return Static(g, gamma, before.pull, information, theta, cov, update.score, modes.directions @ theta)
+    pull = before.pull + (relative * update.innovation) @ modes.directions
+    theta, cov = _learned(modes, before, information, pull)
+    score, constant = update.innovation / update.variance, modes.directions @ theta
+    score -= relative * constant
+    return Static(g, gamma, pull, information, theta, cov, score, constant)
 
 
-def _learned(modes: Modes, now: Static, pull: Floats) -> tuple[Floats, Floats]:
+def _learned(modes: Modes, before: Static, information: Floats, pull: Floats) -> tuple[Floats, Floats]:
     """Theta of this tick, (r,), and N of this tick or an earlier one, (r, r)."""
     if modes.sign.size > FEW:
-        theta, near = now.theta, CLOSE * float(np.abs(pull).max(initial=0.0))
+        theta, near = before.theta, CLOSE * float(np.abs(pull).max(initial=0.0))
         for _ in range(REFINEMENTS):
-            rest = pull - _precision_times(modes, now, theta)
+            rest = pull - _precision_times(modes, information, theta)
             if float(np.abs(rest).max()) <= near:
-                return theta, now.cov
-            theta = theta + now.cov @ rest
-    cov = _covariance(modes, now.information)
+                return theta, before.cov
+            theta = theta + before.cov @ rest
+    cov = _covariance(modes, information)
     return cov @ pull, cov
 
 
-def _precision_times(modes: Modes, now: Static, theta: Floats) -> Floats:
-    """``N^-1 theta`` of this tick, (r,)."""
+def _precision_times(modes: Modes, information: Floats, theta: Floats) -> Floats:
+    """``N^-1 theta`` by the information (t,), (r,)."""
     G = modes.directions
-    return np.asarray(modes.sign * theta + (now.information * (G @ theta)) @ G)
+    return np.asarray(modes.sign * theta + (information * (G @ theta)) @ G)
 
 
 def current(modes: Modes, now: Static) -> Static:
@@ -170,11 +173,14 @@ def of_busbar(modes: Modes, now: Static) -> Floats:
 
 
 def restored(modes: Modes, now: Static) -> Static:
-    """The same with the pull that belongs to theta: the modal filter goes on with it.
+    """The same with the pull and the constant errors that belong to theta: the modal filter goes on with it.
 
     Parameters
     ----------
     modes, now
         The modes, and the information so far.
     """
-    return replace(now, pull=_precision_times(modes, now, now.theta)) if modes.sign.size else now
+    if not modes.sign.size:
+        return now
+    pull = _precision_times(modes, now.information, now.theta)
+    return replace(now, pull=pull, constant=modes.directions @ now.theta)

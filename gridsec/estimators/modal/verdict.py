@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cache
 from math import inf, log
 from typing import Any
 
@@ -33,7 +32,8 @@ from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.costs import amounts
 from gridsec.estimators.modal.detector import SIZE, WEIGHTS, Evidence
 from gridsec.estimators.modal.search import DOUBT
-from gridsec.estimators.modal.signatures import Scores
+from gridsec.estimators.modal.signatures import Onsets
+from gridsec.estimators.modal.static import Static
 from gridsec.estimators.plant import NO_VOLTAGE
 from gridsec.estimators.sequential.design import SequentialDesign
 from gridsec.estimators.sequential.device_checks import probability
@@ -96,10 +96,9 @@ def meter_evidence(  # noqa: PLR0917  # the core, one tick, and one limit
     """
     made, test, (m, seen), update = core.modes, state.detector, now, state.update
     row = _row(state, evidence, suspicion)
-    one = signatures.scores(made, test.onsets, state.static, np.array([row]))
-    tested, enough = np.zeros_like(seen), 2.0 * core.limit / widest**2
+    tested, enough = np.zeros(seen.size, dtype=np.bool_), 2.0 * core.limit / widest**2
     if update is not None:
-        least = test.precision or detector.precision(made, None, update)
+        least = detector.precision(made, None, update) if test.precision is None else test.precision
         tested = seen & (least.least >= enough)
         if np.count_nonzero(tested) < np.count_nonzero(seen):
             tested = seen & (least.exact(made, update) >= enough)
@@ -110,7 +109,8 @@ def meter_evidence(  # noqa: PLR0917  # the core, one tick, and one limit
     if any_of(state.masked.meters) and state.filter.full is not None:
         masked = (state.masked.meters, *deviations(core, state, m))
         tested = tested | (state.masked.meters & seen)
-    return MeterEvidence(tested, _Amounts(core, one, float(test.capital[0, row]), seen, masked))
+    one, capital = signatures.single(test.onsets, row), float(test.capital[0, row])
+    return MeterEvidence(tested, _Amounts(core, one, state.static, capital, seen, masked))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,7 +118,8 @@ class _Amounts:
     """Score and threshold of every meter at one onset."""
 
     core: Core
-    one: Scores  # of the onset
+    one: Onsets  # the onset by itself
+    static: Static  # information about the directions
     capital: float  # its logarithm
     seen: Bools  # (p,) meters with a reading
     # masked meters, with the deviations of their readings from the filter and the standard deviations
@@ -126,7 +127,8 @@ class _Amounts:
 
     def __call__(self) -> tuple[Floats, Floats]:
         made = self.core.modes
-        y, F = (each[0] for each in self.one.of(made.U.T, made.squares.T))
+        now = signatures.scores(made, self.one, self.static)
+        y, F = (each[0] for each in now.of(made.U.T, made.squares.T))
         F = np.maximum(F, _TINY)
         part = log(WEIGHTS[0] / made.size) + self.capital
         gain = 2.0 * (self.core.limit - part) + np.log1p(SIZE**2 * F)
@@ -155,18 +157,22 @@ class Answer(Verdict):
     ) -> Answer:
         """Verdict with the function `amounts` of score and threshold, (p,) each; `rest` as in `Verdict`."""
         made = cls(*finding, suspects, PENDING, PENDING, attack, **rest)
-        object.__setattr__(made, "_amounts", cache(amounts))
+        object.__setattr__(made, "_amounts", amounts)
         return made
 
     @deferred(Verdict)
     def score(self) -> Floats:
         """Residual of each meter, squared pu, (p,); NaN without a reading."""
-        return self._amounts()[0]
+        score, threshold = self._amounts()
+        object.__setattr__(self, "threshold", threshold)
+        return score
 
     @deferred(Verdict)
     def threshold(self) -> Floats:
         """Largest score of an honest meter, squared pu, (p,)."""
-        return self._amounts()[1]
+        score, threshold = self._amounts()
+        object.__setattr__(self, "score", score)
+        return threshold
 
 
 def deviations(core: Core, state: CoreState, m: Floats) -> tuple[Floats, Floats]:
@@ -204,7 +210,7 @@ def offsets(core: Core, state: CoreState, m: Floats) -> Floats:
     mean = w + b
     if made.sign.size:
         g_w, g_b = state.static.signature
-        mean += (1.0 - g_w - g_b) * (made.directions @ state.static.theta)
+        mean += (1.0 - g_w - g_b) * state.static.constant
     return np.asarray(m - made.back @ mean)
 
 
@@ -223,7 +229,7 @@ def _row(state: CoreState, evidence: Evidence, suspicion: Suspicion | None) -> i
         of_meters = np.where(onsets.used, evidence.by_row[0], -inf)
         if of_meters.max() > -inf:
             return int(of_meters.argmax())
-    return int(np.where(onsets.used & ~onsets.ramp, onsets.age, -1).argmax())
+    return int((onsets.age * ~onsets.ramp).argmax())
 
 
 # --- Explanations ---
@@ -412,7 +418,7 @@ def verdict(design: SequentialDesign, now: Inputs, estimate: Estimate) -> Findin
             names=design.names,
             max_attacked=max(1, min(design.max_attacked, live // 3)),
             live=tested,
-            suspected=np.zeros_like(now.named),
+            suspected=np.zeros(tested.size, dtype=np.bool_),
             named=now.named,
             wide=tested & ~(now.evidence.tested | now.unread),
             valid=True,

@@ -197,4 +197,4 @@ def test_factors_of_the_regression_are_the_whole() -> None:
     assert np.allclose(estimate._mean(prepared, w, b, e), expected, rtol=0.0, atol=1e-12)
     even = some_meters()
     even = replace(even, white=np.full(5, 1e-5), fixed=np.full(5, 2e-5))
-    assert estimate.estimator(modes(even)).left.shape[1] <= 2
+    assert estimate.estimator(modes(even)).right.shape[0] <= 2
