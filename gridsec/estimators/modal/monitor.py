@@ -363,8 +363,9 @@ def _identified(
     suspicion = core.identify(kernel, state.core, evidence, suspicion)
     named = suspicion.found.named & ~state.core.masked.meters
     streak = np.where(suspicion.found.chosen[0, : named.size], state.streak + 1, 0)
-    phases = np.where(verdict.certain_phases(kernel, suspicion), state.phases + 1, 0)
-    certain = verdict.certain_inverters(design.front, kernel, suspicion, uses_q)
+    certain = verdict.certain_phases(kernel, suspicion) & suspicion.fits
+    phases = np.where(certain, state.phases + 1, 0)
+    certain = verdict.certain_inverters(design.front, kernel, suspicion, uses_q) & suspicion.fits
     inverters = np.where(certain, state.inverters + 1, 0)
     age = int(state.core.detector.onsets.age[suspicion.row])
     # A fault with a first naming is searched again at the next tick.

@@ -51,6 +51,8 @@ WITHIN_S = 600.0
 
 The variances are those times `WITHIN_S` over the correlation time, between its share of `REPORTED_S` and 1.
 """
+RECENT = 8.0
+"""Memory of the share of ticks with a jump, ticks."""
 RATE = 1.0 / 60.0
 """Prior probability of a jump of each size, per tick: kettles and cars of a street."""
 
@@ -74,6 +76,10 @@ class Rival:
         The onset, in row 0, in the modes, and its exact scores where readings have been missing.
     jumps
         Number of jumps; None where the loads never jump.
+    unsteady
+        Share of the last ticks with a jump, 1: a mean with the memory of `RECENT` ticks.
+    misfit
+        Squares of the whitened innovations since the onset, less their expectation without a fault.
     update
         The filter's last step.
     loads
@@ -88,6 +94,8 @@ class Rival:
     onsets: Onsets
     suspected: Suspected | None
     jumps: int | None
+    unsteady: float = 0.0
+    misfit: float = 0.0
     update: Update | None = None
     loads: float = 1.0
 
@@ -209,12 +217,14 @@ def follow(  # noqa: PLR0917  # the state, and one tick
         state = _jumped(modes, state, gap, size)
     state, known, update = exact.step(modes, state, known, t, m, seen, stay=True, unknown=unknown, jump=jump)
     if update.exact is None:
-        total -= 0.5 * float((update.innovation**2 / update.variance + np.log(update.variance)).sum())
+        squares, count = float((update.innovation**2 / update.variance).sum()), modes.size
+        total -= 0.5 * (squares + float(np.log(update.variance).sum()))
         if begun or onsets.used[0]:
             onsets = signatures.follow(modes, onsets, update, known, gap.h, begun=[0] if begun else [])
     else:
         half, white = update.exact.half, update.exact.white
-        total -= 0.5 * float(white @ white) + float(np.log(half.diagonal()).sum())
+        squares, count = float(white @ white), white.size
+        total -= 0.5 * squares + float(np.log(half.diagonal()).sum())
         if begun:
             suspected = replay.begun(modes, 0, bool(onsets.ramp[0]))
         if suspected is not None:
@@ -228,6 +238,8 @@ def follow(  # noqa: PLR0917  # the state, and one tick
         onsets=onsets,
         suspected=suspected,
         jumps=jumps,
+        unsteady=before.unsteady + (float(size > 0.0) - before.unsteady) / RECENT,
+        misfit=squares - count + (0.0 if begun else before.misfit),
         update=update,
         loads=loads,
     )

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from benchmarks._residuals import Source, model_of, tree
+from benchmarks._residuals import Source, model_of, power_columns, tree
 from gridsec.estimators import sequential
 from gridsec.estimators.modal import core
 from gridsec.estimators.modal.model import REPORTED_S, modes, residual_model
@@ -17,6 +18,7 @@ from tests.gridsec.street import Street, make_plant
 
 MODEL = model_of(tree(12, np.random.default_rng(3)))
 LIAR = 4
+STEPS = power_columns(tree(12, np.random.default_rng(3)))[:, :12]
 
 
 def front(customers: int = 12) -> tuple[SequentialDesign, Street]:
@@ -153,3 +155,34 @@ def test_jumps_at_every_tick_are_no_evidence() -> None:
     assert state.loads > 10.0
     jumped = core.estimate(kernel, state).variance
     assert (jumped >= core.estimate(kernel, replace(state, loads=1.0)).variance).all()
+
+
+@pytest.mark.parametrize(
+    ("pattern", "fits"),
+    [
+        (lambda _: 1.0, True),
+        (lambda k: 0.5 + 0.005 * k, True),
+        (lambda k: (-1.0) ** k, False),
+        (lambda k: (-1.0) ** (k // 2), False),
+    ],
+    ids=["lasting", "growing", "alternating", "by pairs"],
+)
+def test_names_need_an_explanation_of_the_misfit(pattern: Callable[[int], float], fits: bool) -> None:
+    """A third that alternates fits no lasting fault: nothing is named, neither meters nor loads adopted."""
+    kernel = core.assemble(MODEL, np.vstack([np.zeros(12), STEPS]), np.full(12, 0.1), gamma=1e6)
+    source, state, liars = Source(MODEL, np.random.default_rng(8)), core.init(kernel, 0.0), [2, 4, 5, 9]
+    lie, found = np.array([0.08, -0.06, 0.07, 0.09]), None
+    for k in range(125):
+        m = source.tick()
+        if k >= 100:
+            m[liars] += pattern(k - 100) * lie
+        state, evidence = core.step(kernel, state, float(k), m)
+        if k >= 103:
+            assert core.alarmed(kernel, evidence)
+            found = core.identify(kernel, state, evidence, found)
+            assert found.fits is fits
+            assert not (found.found.named & ~np.isin(np.arange(12), liars)).any()
+            assert fits or not found.found.named.any()
+            assert fits or core.adopt(kernel, state, found) is state
+    assert found is not None
+    assert not fits or found.found.named[liars].all()
