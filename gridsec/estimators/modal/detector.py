@@ -329,7 +329,8 @@ def log_lambda(y: Floats, F: Floats, s2: Floats) -> Floats:
 def _log_mean(each: Floats) -> Floats:
     """Logarithm of the mean over the last axis."""
     top = each.max(axis=1)
-    return np.asarray(top + np.log(np.exp(each - top[:, None]).sum(axis=1) / each.shape[1]))
+    ratio = each - top[:, None]
+    return np.asarray(top + np.log(np.exp(ratio, out=ratio).sum(axis=1) / each.shape[1]))
 
 
 def omnibus(now: Scores, s2: float) -> Floats:
