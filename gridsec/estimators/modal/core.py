@@ -543,14 +543,17 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
 
 
 def _fits(state: CoreState, found: Identification) -> bool:
-    """The best explanation takes enough of the misfit of its model of the loads away."""
+    """The best explanation takes enough of the misfit away, by the model of the loads or a steady rival."""
     if not state.rivals:
         return True
-    model, chosen = state.rivals[int(found.model[0])], found.chosen[0]
-    problem = found.problems[int(found.model[0])]
-    # Twice the logarithm of a ratio of likelihoods.
-    gain = float(problem.y[chosen] @ mean_amounts(problem, chosen))
-    return gain >= EXPLAINED * model.misfit and model.unsteady < OFTEN
+    for at in dict.fromkeys((0, int((found.model == 0).argmax()))):
+        number, chosen = int(found.model[at]), found.chosen[at]
+        problem, model = found.problems[number], state.rivals[number]
+        # Twice the logarithm of a ratio of likelihoods.
+        gain = float(problem.y[chosen] @ mean_amounts(problem, chosen))
+        if gain >= EXPLAINED * model.misfit and (number == 0 or model.unsteady < OFTEN):
+            return True
+    return False
 
 
 def _keeping(found: Identification) -> Bools:

@@ -22,16 +22,17 @@ The estimate uses the standard deviations themselves: d is estimated from the re
 n being the meters with a reading.
 
 **Loads that jump.** The error of a power follows the power. Its half-width l is that of the frame; for a
-reactive power that the model adds, it is that power as well. Let l change by d_j in a tick, and by m_j in the
-same direction shortly before. The error has changed by a number of the variance ``(m_j + d_j)^2 / 3``. The
-part ``m_j^2 / 3`` has been accounted for. With the design's deviations s_j, without common parts,
+reactive power that the model adds, it is that power as well. Let l rise by d_j in a tick, and by m_j shortly
+before. The error has changed by a number of the variance ``(m_j + d_j)^2 / 3``. The part ``m_j^2 / 3`` has
+been accounted for. With the design's deviations s_j, without common parts,
 
     sum_j a_j a_j' (d_j^2 + 2 m_j d_j) / 3  <=  r S,   r = max_j (d_j^2 + 2 m_j d_j) / (3 s_j^2),
 
-where ``m_j <- d_j + exp(-h / RISE_S) m_j``, with 0 in place of the old m_j where the direction turns. The
-variance of w gains r S in such a tick. Movements below `NOTICED` do not count, and r is at most `FARTHEST`.
-The mean of w stays: what lasts is not renewed with a power. Where frames are more than `SUDDEN_S` apart by
-design, all powers change from one to the next, and w as its model has it.
+where ``m_j <- max(0, exp(-h / RISE_S) m_j + d_j)``, and the same for falls. The variance of w gains r S in
+such a tick. Movements below `NOTICED` do not count; the first one above counts as a whole. r is at most
+`FARTHEST`. The mean of w stays: what lasts is not renewed with a power. Where frames are more than `SUDDEN_S`
+apart by design, all powers change from one to the next, and w as its model has it. A reactive power with a
+reading and one that the model adds are not compared.
 """
 
 from __future__ import annotations
@@ -90,11 +91,12 @@ class Unknown:
         return WIDER * self.meters
 
 
-def unknown(
+def unknown(  # noqa: PLR0917  # the state, and one frame
     design: SequentialDesign,
     measured: Measurements,
     uncertainty: FrameUncertainty,
     injected: Floats,
+    free: Bools,
     skew: ClockSkew | None,
 ) -> Unknown | None:
     """Directions that a frame leaves unknown; None for none.
@@ -107,10 +109,12 @@ def unknown(
         Uncertainty of the frame beyond that of the design.
     injected : (m,)
         Half-widths of the errors of the injections, pu.
+    free : (m,)
+        Inverters that follow the estimate: an error of that lasts.
     skew
         Changes of the voltages within clock offsets.
     """
-    columns = _powers(design, measured, uncertainty, injected)
+    columns = _powers(design, measured, uncertainty, injected, free)
     metered = np.asarray(measured.busbar_metered)
     places = design.prior.variance.size
     if not all_of(metered):
@@ -148,12 +152,15 @@ class Movements:
     ----------
     level : (2 N,)
         l of the last reading of each power, with the sign of the reactive power; NaN before the first.
-    moved : (2 N,)
-        m, the last movement in one direction.
+    moved : (2, 2 N)
+        m of rises and of falls.
+    metered : (N,)
+        Reactive powers that the model takes from a reading.
     """
 
     level: Floats
     moved: Floats
+    metered: Bools
 
 
 def jump(
@@ -172,9 +179,10 @@ def jump(
     measured, h
         The measurements of this frame, and the interval from the last one, s.
     """
-    frame, doubt = usual(measured.frame), design.doubt
-    assumed = np.where(measured.uses_q, 0.0, frame.q)
-    level = np.concatenate([frame.p_error, assumed + np.copysign(frame.q_error, frame.q)])
+    frame, doubt, N, metered = usual(measured.frame), design.doubt, design.customers, measured.uses_q
+    level = np.concatenate([frame.p_error, frame.q + np.copysign(frame.q_error, frame.q)])
+    if any_of(metered):
+        level[N:][metered] = np.copysign(frame.q_net_error, frame.q)[metered]
     if doubt.sudden_p is not None:
         # Unknown directions of every frame.
         level[np.tile(doubt.sudden_p > 0.0, 2)] = 0.0
@@ -183,23 +191,35 @@ def jump(
         read = np.tile(frame.p_origin == PowerOrigin.READ, 2)
         level = np.where(read, level, np.nan if before is None else before.level)
     if before is None:
-        return 0.0, Movements(level, np.zeros(level.size))
-    change, moved = np.nan_to_num(level - before.level, copy=False), exp(-h / RISE_S) * before.moved
-    moved[moved * change < 0.0] = 0.0
-    now = Movements(level, moved + change)
-    noticed = np.abs(now.moved) * reach > sqrt(3.0) * NOTICED
+        return 0.0, Movements(level, np.zeros((2, 2 * N)), metered)
+    change = np.nan_to_num(level - before.level, copy=False)
+    if any_of(metered) or any_of(before.metered):
+        change[N:][metered != before.metered] = 0.0
+    old = exp(-h / RISE_S) * before.moved
+    now = Movements(level, np.maximum(old + change * _SIGNS, 0.0), metered)
+    least = sqrt(3.0) * NOTICED
+    noticed = now.moved * reach > least
     if design.step_s > SUDDEN_S or not any_of(noticed):
         return 0.0, now
-    gained = change[noticed] * (change[noticed] + 2.0 * moved[noticed])
-    ratio = gained / (3.0 * np.maximum(doubt.own.ravel()[noticed], EXACT) ** 2)
+    # The movement in the direction of the change; what was too small to count before counts now.
+    counted = np.where(old * reach > least, np.abs(change) * (np.abs(change) + 2.0 * old), now.moved**2)
+    gained = (counted * (noticed & (change * _SIGNS > 0.0))).max(axis=0)
+    ratio = gained / (3.0 * np.maximum(doubt.own.ravel(), EXACT) ** 2)
     return min(float(ratio.max()), FARTHEST), now
 
 
+_SIGNS = np.array([[1.0], [-1.0]])
+
+
 def _powers(
-    design: SequentialDesign, measured: Measurements, uncertainty: FrameUncertainty, injected: Floats
+    design: SequentialDesign,
+    measured: Measurements,
+    uncertainty: FrameUncertainty,
+    injected: Floats,
+    free: Bools,
 ) -> list[Floats]:
     """Directions of powers and injections, none or (n, k)."""
-    unsettled, doubt = _unsettled(design, injected, measured.uses_q), design.doubt
+    unsettled, doubt = _unsettled(design, injected, free, measured.uses_q), design.doubt
     if uncertainty.usual and unsettled is None and doubt.sudden_p is None:
         return []
     frame = usual(measured.frame)
@@ -220,13 +240,15 @@ def _wider(error: Floats, known: Floats, wider: Bools, sudden: Floats | None) ->
     return np.where(wider if sudden is None else wider | (sudden > 0.0), np.sqrt(more), 0.0)
 
 
-def _unsettled(design: SequentialDesign, injected: Floats, metered: Bools) -> Floats | None:
+def _unsettled(design: SequentialDesign, injected: Floats, free: Bools, metered: Bools) -> Floats | None:
     """Standard deviation of injections known far less well than the design supposes, (N,), pu."""
     droop, N = design.plant.droop, design.customers
     error = droop.per_customer(injected, N)
     error /= np.sqrt(3.0)
     usually = design.injections + droop.per_customer(design.mismatch, N)
     out = error > UNSETTLED * np.maximum(usually, EXACT)
+    if any_of(free):
+        out[droop.customer[free]] = True
     return np.where(out & ~metered, error, 0.0) if any_of(out) else None
 
 

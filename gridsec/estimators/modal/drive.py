@@ -5,16 +5,18 @@
     accused(...) -> InjectionError                              where a meter loses its trust
 
 A manipulated reading that drives an inverter of the model moves the residuals of all others. An inverter
-without a trusted meter follows the last estimate, moved by the model. The error z of its input has the
+with a distrusted meter follows the last estimate, moved by the model. The error of its input has the
 deviation s of the estimate in place of the error of the reading:
 
     e' = -(e - K sqrt(3) s - mismatch) / tau,   K the slope of the curve
 
 The front end's own error of such an inverter is an interval of everything possible, for `Estimate.bound`.
-As a deviation it is far too wide: an injection that is unknown hides the readings of its neighbours.
+As a deviation it is far too wide: an injection that is unknown hides the readings of its neighbours. While
+meters collude, the estimate may err by more than its deviation, and for long. So e is an unknown direction of
+the frame (`doubts`).
 
-A meter that loses its trust has driven its inverter by a false reading. Its injection is unknown then, and
-stays so for some time constants of the inverter.
+A meter that loses its trust at a tick at which it drove its inverter has done so by a false reading. The
+injection is unknown then, and stays so for some time constants of the inverter.
 """
 
 from __future__ import annotations
@@ -25,10 +27,10 @@ from math import sqrt
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, any_of, changed
-from gridsec.estimators.modal import verdict
+from gridsec.estimators.modal import doubts, verdict
 from gridsec.estimators.modal.core import Core, CoreState
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.measurements import Measurements, measurements
+from gridsec.estimators.sequential.measurements import FrameUncertainty, Measurements, measurements
 from gridsec.estimators.sequential.state import InjectionError, Prediction, SequentialState
 from gridsec.estimators.sequential.step import injection_target, predict, relaxed
 
@@ -53,12 +55,14 @@ def driven(  # noqa: PLR0917  # the state, and one frame
     state: CoreState,
     given: SequentialState,
     measured: Measurements,
-    sizes: Floats,
+    uncertainty: FrameUncertainty,
+    before: InjectionError,
     own: Floats,
 ) -> tuple[SequentialState, Measurements, Prediction]:
     """Front end, measurements and prediction without inverters driven by a reading that jumps.
 
-    A reading beyond `JUMP` standard deviations of its innovation counts as not trusted at this tick.
+    A reading beyond `JUMP` standard deviations of its innovation counts as not trusted at this tick. What the
+    frame leaves unknown is a part of the innovation.
 
     Parameters
     ----------
@@ -66,12 +70,14 @@ def driven(  # noqa: PLR0917  # the state, and one frame
         The front end and the core.
     state, given
         The state of the core, and that of the front end.
-    measured, sizes
-        The measurements of the frame, and sizes of false powers.
+    measured, uncertainty
+        The measurements of the frame, and its uncertainty beyond that of the design.
+    before
+        Errors of the injections before the tick.
     own : (p,)
         Own errors of the meters.
     """
-    predicted = predict(front, given, measured, sizes)
+    predicted = predict(front, given, measured, uncertainty.sizes)
     if state.update is None or not front.meter_of.size or given.x is None:
         return given, measured, predicted
     m = measured.y - expected(predicted.v2_bus[front.prior.meters], own)
@@ -85,6 +91,10 @@ def driven(  # noqa: PLR0917  # the state, and one frame
     if not any_of(drives & far):
         return given, measured, predicted
     off, std = verdict.deviations(core, state, m)
+    free = estimated(front, given.trust.trusted)
+    open_ = doubts.unknown(front, measured, uncertainty, before.error, free, given.clock_skew)
+    if open_ is not None:
+        std = np.sqrt(std**2 + (open_.wide**2).sum(axis=1))
     jumps = drives & (np.abs(off) > JUMP * std)
     if not 0 < np.count_nonzero(jumps) <= front.max_attacked:
         # Where most readings jump, the busbar's or the loads have; then no inverter can do without them.
@@ -92,7 +102,7 @@ def driven(  # noqa: PLR0917  # the state, and one frame
     trusted = given.trust.trusted & ~jumps
     given = changed(given, trust=replace(given.trust, trusted=trusted))
     measured = measurements(front, measured.frame, trusted, given.busbar.trusted, given.v0_squared)
-    return given, measured, predict(front, given, measured, sizes)
+    return given, measured, predict(front, given, measured, uncertainty.sizes)
 
 
 def followed(  # noqa: PLR0917  # the state, and one frame
@@ -119,14 +129,27 @@ def followed(  # noqa: PLR0917  # the state, and one frame
     own, meter, at = now.injection_error, front.meter_of, front.plant.droop.customer
     if not meter.size or given.last is None:
         return own
-    trusted, width = given.trust.trusted[meter], own.width
-    free = (meter >= 0) & ~trusted
+    trusted, free, width = given.trust.trusted[meter], estimated(front, given.trust.trusted), own.width
     if any_of(free):
         width = np.where(free, sqrt(3.0) * given.last[0].std[at], width)
     target = injection_target(front, before, own.input, width)
     errors = relaxed(front, before, own.input, width, target, h)
     # A metered power that no curve allows is not used, and then the injection is unknown.
-    return errors.reset((measured.reports_q & ~measured.uses_q)[at] & trusted)
+    read = (meter >= 0) & trusted & measured.available[meter]
+    return errors.reset((measured.reports_q & ~measured.uses_q)[at] & read)
+
+
+def estimated(front: SequentialDesign, trusted: Bools) -> Bools:
+    """Inverters that follow the estimate, (m,).
+
+    Parameters
+    ----------
+    front
+        The front end.
+    trusted : (p,)
+        Trusted meters.
+    """
+    return np.asarray((front.meter_of >= 0) & ~trusted[front.meter_of])
 
 
 def accused(front: SequentialDesign, errors: InjectionError, which: Bools) -> InjectionError:

@@ -22,7 +22,7 @@ from gridsec.arrays import Bools, Floats, Ints
 from gridsec.estimators.modal.filter import Full
 from gridsec.estimators.modal.model import Modes
 
-RELEASE, MOST = 6, 60
+RELEASE, MOST = 6, 12
 """Least readings that agree before a release, and readings from which on the mean decides at the latest."""
 OUTLIER = 4.0
 """Standard deviations of a single reading that disagrees, 1."""

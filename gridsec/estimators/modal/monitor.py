@@ -270,7 +270,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     )
     own, trusted = own_errors(design, state.core), given.trust.trusted
     given, measured, predicted = drive.driven(
-        front, design.core, state.core, given, measured, uncertainty.sizes, own
+        front, design.core, state.core, given, measured, uncertainty, state.injections, own
     )
     h = frame.t - given.t
     injections = drive.followed(front, state.injections, given, measured, predicted, h)
@@ -292,7 +292,8 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
         attack_kinds=kinds,
         v0_squared=measured.v0_squared,
     )
-    open_ = doubts.unknown(front, measured, uncertainty, injections.error, skew)
+    free = drive.estimated(front, given.trust.trusted)
+    open_ = doubts.unknown(front, measured, uncertainty, injections.error, free, skew)
     jump, movements = doubts.jump(front, design.reach, state.movements, measured, h)
     seen, whole, m = measured.available, all_of(measured.available), measured.y - drive.expected(v2, own)
     if not whole:
@@ -313,7 +314,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
         # A phase named at this tick is not metered any more.
         metered = np.asarray(measured.busbar_metered) & after.front.busbar.trusted
         measured = replace(measured, busbar_metered=metered if metered.size > 1 else bool(metered[0]))
-        open_ = doubts.unknown(front, measured, uncertainty, injections.error, skew)
+        open_ = doubts.unknown(front, measured, uncertainty, injections.error, free, skew)
     tick = _Tick(measured, predicted, injections, open_, evidence, m, held)
     return _answered(design, after, tick)
 
@@ -797,9 +798,17 @@ def renew(design: ModalDesign, state: ModalState, which: Bools) -> ModalState:
         attack_kinds=replace(kinds, history=forget_readings(kinds.history, which)),
         trust=state.front.trust.replaced(which),
     )
-    zero, held = (0 * state.streak, 0 * state.phases, 0 * state.inverters), np.where(which, 0, state.held)
-    return ModalState(
-        now, begun, None, *zero, 0, record.made(modes, opened, kernel.static), held, state.injections
+    return replace(
+        state,
+        front=now,
+        core=begun,
+        suspicion=None,
+        streak=0 * state.streak,
+        phases=0 * state.phases,
+        inverters=0 * state.inverters,
+        due=0,
+        kept=record.made(modes, opened, kernel.static),
+        held=np.where(which, 0, state.held),
     )
 
 

@@ -217,8 +217,8 @@ def follow(  # noqa: PLR0917  # the state, and one tick
         state = _jumped(modes, state, gap, size)
     state, known, update = exact.step(modes, state, known, t, m, seen, stay=True, unknown=unknown, jump=jump)
     if update.exact is None:
-        squares, count = float((update.innovation**2 / update.variance).sum()), modes.size
-        total -= 0.5 * (squares + float(np.log(update.variance).sum()))
+        squares, count = float(known.score @ (update.variance * known.score)), modes.size
+        total -= 0.5 * float((update.innovation**2 / update.variance + np.log(update.variance)).sum())
         if begun or onsets.used[0]:
             onsets = signatures.follow(modes, onsets, update, known, gap.h, begun=[0] if begun else [])
     else:

@@ -136,7 +136,8 @@ def directions(site: Site, age: float) -> tuple[ModalDesign, Unknown]:
     front, state, frame = made.front, init(made, T).front, to_frame(site, said(site, 1.0, age))
     measured = measurements(front, frame, state.trust.trusted, state.busbar.trusted, state.v0_squared)
     uncertainty = update_uncertainty(front, state.uncertainty, frame, measured.available, True)
-    found = unknown(front, measured, uncertainty, predict(front, state, measured, uncertainty.sizes), None)
+    injected = predict(front, state, measured, uncertainty.sizes).injection_error.error
+    found = unknown(front, measured, uncertainty, injected, np.zeros(injected.size, dtype=np.bool_), None)
     assert found is not None
     return made, found
 
@@ -232,11 +233,17 @@ def test_loads_jump_with_their_reported_powers(site: Site) -> None:
     # A power that comes back is compared with its last reading, and its first one with none.
     assert jumps(1.0, gap, gap, 4.0) == pytest.approx([0.0, 0.0, share])
     assert jumps(gap, 4.0, 4.0) == [0.0, 0.0]
-    # The meter takes the place of the power that the model adds.
+    # A dip within a rise costs its own size only: parts of two watts beside those of kilowatts.
+    dipped = jumps(1.0, 2.0, 3.0, 2.998, 4.0, h=1e-6)
+    assert sum(dipped) == pytest.approx(share, rel=0.01)
+    # Steps that no meter would see count once their sum is seen.
+    slow = jumps(*np.linspace(1.0, 4.0, 31).tolist(), h=1e-6, factor=4.0)
+    assert slow[0] == 0.0
+    assert sum(slow) == pytest.approx(share, rel=1e-4)
+    # A metered reactive power is not compared with one of the model, and has its own error.
     metered = reading(1.0, reported=0.3)
-    whole = abs(one.q[at]) + one.q_error[at]
-    assert jumps(1.0, metered) == pytest.approx([share * (whole / c) ** 2])
-    assert jumps(metered, reading(4.0, reported=0.3)) == [0.0]
+    assert jumps(1.0, metered, 1.0, metered, factor=100.0) == [0.0, 0.0, 0.0]
+    assert jumps(metered, reading(1.0, reported=0.302), factor=100.0)[0] < 1e-6
     assert jumps(1.0, 4.0, of=replace(front, step_s=doubts.SUDDEN_S + 1.0)) == [0.0]
     # Powers of a stated age are unknown directions of every frame already.
     stale = replace(front.doubt, sudden_p=0.5 * front.doubt.p, sudden_q=0.5 * front.doubt.q)

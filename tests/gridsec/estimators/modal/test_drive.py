@@ -21,9 +21,11 @@ LIE = 0.06
 
 def watched(lies: tuple[int, ...]) -> tuple[ModalDesign, list[tuple[ModalState, Verdict, Floats]]]:
     """Meters that read 3 % too high and too low by turns, with all states, verdicts and true injections."""
-    plant = make_plant(np.random.default_rng(5), customers=12, drop=0.03)
-    front = prepare(plant)
-    made, street = design(plant, doubt=front.doubt, step_s=1.0), Street(plant, np.random.default_rng(6))
+    plant = make_plant(np.random.default_rng(5), customers=12, drop=0.08)
+    front, street = prepare(plant), Street(plant, np.random.default_rng(6))
+    street.v0 = 0.95
+    street.rest()
+    made = design(plant, doubt=front.doubt, step_s=1.0)
     state, out = init(made, street.t), []
     for k in range(TICKS):
         street.advance(1.0)
@@ -45,14 +47,23 @@ def shifted(frame: Frame, meters: tuple[int, ...], by: float) -> Frame:
 def test_readings_that_alternate_leave_the_injections_known(lies: tuple[int, ...]) -> None:
     """The model's injections stay within their stated errors, and these a part of what is possible."""
     made, told = watched(lies)
-    front, last = made.front, told[-1][0]
+    front, droop, last = made.front, made.plant.droop, told[-1][0]
+    at = np.isin(front.meter_of, lies)
+    assert np.abs(told[-1][2][at]).max() > 0.003
     for state, _, x in told[ONSET:]:
         assert state.front.x is not None
         assert (np.abs(state.front.x - x) <= state.injections.error).all()
-    usual = front.injections[front.plant.droop.customer] + front.mismatch
-    at = np.isin(front.meter_of, lies)
+    usual = front.injections[droop.customer] + front.mismatch
     assert (last.injections.error < np.sqrt(3.0) * doubts.UNSETTLED * usual)[at].all()
     assert (last.injections.error < last.front.injection_error.error)[at].all()
+    # At rest, K (sqrt(3) s + |change of the input|) + mismatch: the deviation of the estimate counts.
+    before = told[-2][0]
+    assert before.front.last is not None
+    width = np.sqrt(3.0) * before.front.last[0].std[droop.customer]
+    moved = np.abs(last.injections.input - before.injections.input)
+    aim = droop.slope * (np.maximum(width, before.injections.width) + moved) + front.mismatch
+    shown = (last.injections.error - np.exp(-1.0 / droop.tau) * before.injections.error)[at]
+    assert np.allclose(shown, ((1.0 - np.exp(-1.0 / droop.tau)) * aim)[at])
 
 
 @pytest.mark.parametrize("lies", [(4,), (4, 7, 9), (3, 4, 7, 9)], ids=["one", "a quarter", "a third"])
