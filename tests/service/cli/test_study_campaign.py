@@ -30,7 +30,7 @@ def test_tables_are_printed_and_written(
     some = ("--kind", "bias:3,5", "--liars", "1", "--place", "random", "--out", str(out))
     code, told, _ = run(monkeypatch, capsys, *FEW, *some, "--journal", str(journal))
     assert code == 0
-    assert "cigre-lv: 3 scenarios of 30 s monitored by sequential" in told
+    assert "cigre-lv: 3 scenarios of 30 s monitored by modal" in told
     assert "By kind and size" in told
     found = pd.read_csv(out / "campaign-scenarios.csv")
     assert found["kind"].tolist() == ["clean", "bias", "bias"]
