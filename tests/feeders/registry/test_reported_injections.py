@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from feeders.model.site import load, names, to_frame
-from feeders.registry import design
+from feeders.model.site import Site, load, names, to_frame
+from feeders.registry import MODAL, SEQUENTIAL, choose, design
 from feeders.simulation.scenario import START
 from feeders.simulation.trial import AttackKind, AttackSpec, LoadError, Trial, TrialMeterErrors, frames
 from gridsec.attack import Bias
@@ -53,19 +53,37 @@ def test_honest_errors_at_their_ends_never_accuse_an_inverter(name: str, step_s:
                     assert (np.abs(estimate.v2 - true) <= estimate.bound).all()
 
 
-@pytest.mark.parametrize(("count", "liar"), [(1, 2), (2, None), (2, 2)])
-def test_all_are_told_of_whoever_else_lies(count: int, liar: int | None) -> None:
-    """Two inverters off their curves are both in an explanation; a named meter hides none of them."""
+def off_their_curves(estimator: str, count: int, liar: int | None) -> tuple[Site, set[int], Verdict]:
+    """A minute of inverters off their curves and of a false meter: the last verdict, and the owners."""
     site = load("cigre-lv")
     lie = AttackSpec(AttackKind.INVERTER, count, 100.0)
     trial = Trial(site, 0, duration_s=60.0, load_error=LoadError(0.1, 0.05), lie=lie, report_q=True)
     honest = trial.scenario
     owners = set(site.droop.customer[honest.inverter_attacks[0].inverters].tolist())
     attacks = () if liar is None else (Bias(np.array([liar]), START + 30.0, START + 90.0, np.array([0.03])),)
-    watcher = design(trial.stated)
+    watcher = design(choose(trial.stated, estimator=estimator))
     state = watcher.init(0.0)
     for frame, _ in frames(trial, replace(honest, attacks=attacks)):
         state, _, verdict = watcher.step(state, frame)
+    return site, owners, verdict
+
+
+@pytest.mark.parametrize(("count", "liar"), [(1, 2), (2, None), (2, 2)])
+def test_the_default_names_an_inverter_and_tells_of_the_other(count: int, liar: int | None) -> None:
+    """The voltages decide for one of two inverters: it is named where `sequential` is UNDECIDED."""
+    site, owners, verdict = off_their_curves(MODAL, count, liar)
+    assert verdict.decision is Decision.ATTACKED
+    assert np.flatnonzero(verdict.suspects).tolist() == ([] if liar is None else [liar])
+    named = set(site.droop.customer[verdict.inverters].tolist())
+    assert len(named) == 1
+    assert named <= owners
+    assert all(site.feeder.customers[owner] in verdict.reason for owner in owners)
+
+
+@pytest.mark.parametrize(("count", "liar"), [(1, 2), (2, None), (2, 2)])
+def test_all_are_told_of_whoever_else_lies(count: int, liar: int | None) -> None:
+    """Two inverters off their curves are both in an explanation; a named meter hides none of them."""
+    site, owners, verdict = off_their_curves(SEQUENTIAL, count, liar)
     assert verdict.decision is (Decision.UNDECIDED if liar is None else Decision.ATTACKED)
     assert np.flatnonzero(verdict.suspects).tolist() == ([] if liar is None else [liar])
     # A manipulated majority of the six meters may explain the readings besides, with the named meter in it.
