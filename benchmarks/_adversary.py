@@ -1,13 +1,13 @@
 """Worlds, monitors and acceptance regions of `benchmarks.adversary`.
 
-The acceptance region of the default monitor is `gridsec.planning.detectability.acceptance_region`. That of
+The acceptance region of the sequential monitor is `gridsec.planning.detectability.acceptance_region`. That of
 the statistical core for a step of age n is, with the exact information I of all modes at that onset,
 
     members:  |(U I U' a)_j| <= y_j,  y_j: log Lambda(y_j, F_jj) = log gamma - log(weight capital / p)
     omnibus:  a' U I M I U' a <= 2 (log gamma - log(weight capital)) + log det,
 
 M being the quadratic form of `gridsec.estimators.modal.detector.omnibus`. The powers' part of the test is
-left out. Other estimators of the registry are played with the attacks made for the default monitor.
+left out. Other estimators of the registry are played with the attacks made for the sequential monitor.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class World:
 
     @property
     def monitor(self) -> DesignedEstimator:
-        """The default monitor, without commissioning of its own."""
+        """The sequential monitor, without commissioning of its own."""
         return self.estimator(SEQUENTIAL)
 
     def estimator(self, name: str, step_s: float = 1.0, commission_s: float = 0.0) -> DesignedEstimator:
@@ -164,7 +164,7 @@ def learning(setting: Setting) -> Iterator[Frame]:
 
 
 def scales(made: SequentialDesign, state: SequentialState) -> Scales:
-    """Scales of the default monitor at one moment."""
+    """Scales of the sequential monitor at one moment."""
     return Scales(made, state.uncertainty, state.window, state.learned, state.model_error)
 
 
@@ -214,7 +214,7 @@ def faults(
     Parameters
     ----------
     where, made, frame
-        The feeder, the default monitor, and the last honest frame.
+        The feeder, the sequential monitor, and the last honest frame.
     meters
         Meters with false voltages.
     powers

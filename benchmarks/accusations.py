@@ -9,7 +9,7 @@ classes alone, knowledge of the powers, and size. `matched`: registers and power
 `unread`: 5 % of the customers report no power. `loads`: errors of 0.6 kW and 0.2 kvar, known as such. Filters
 skip seeds and do not change the others; `--feeder` also takes a feeder that is none of the situation's, for
 checks beside those. `--estimator modal` watches the same data; the linear programs of
-`stealthy` then still know the limits of the default monitor.
+`stealthy` then still know the limits of the sequential monitor.
 
 Per situation: runs; runs with an honest meter accused; most honest meters accused in a run; runs with an
 honest busbar meter or inverter accused; ticks CLEAN, UNDECIDED and ATTACKED after the onset, %; manipulated
@@ -80,7 +80,7 @@ class Stage:
     where
         The feeder.
     design, state, frame
-        The default monitor, its state after the honest seconds, and the last honest frame.
+        The sequential monitor, its state after the honest seconds, and the last honest frame.
     random
         Random numbers of the run.
     size

@@ -1,4 +1,4 @@
-"""Default monitor and modal core against the limits of detection and estimation, as tables in Markdown.
+"""Sequential monitor and modal core against the limits of detection and estimation, as tables in Markdown.
 
     python -m benchmarks.limits [runs] [feeder ...]
 
@@ -7,10 +7,10 @@ known to 0.6 kW and 0.2 kvar with a correlation time of 600 s, no inverters, one
 alarm a year. The first 180 ticks are honest but where stated.
 
 Delays: one random meter is off by a constant part of the voltage; also with meters of class 0.5 % after 10
-and 3 600 honest ticks, where the default monitor does not learn fixed errors. Ticks from the onset, its own
-included, to the first answer that is not CLEAN and to the first tick at which exactly this meter is named,
-means of the runs. Lorden: the least n with ``F_n f^2 / 2 >= log gamma``, F_n: the information after n ticks.
-CUSUM: the largest likelihood ratio over all onsets for the true meter and size, against ``log gamma``.
+and 3 600 honest ticks, where the sequential monitor does not learn fixed errors. Ticks from the onset, its
+own included, to the first answer that is not CLEAN and to the first tick at which exactly this meter is
+named, means of the runs. Lorden: the least n with ``F_n f^2 / 2 >= log gamma``, F_n: the information after n
+ticks. CUSUM: the largest likelihood ratio over all onsets for the true meter and size, against ``log gamma``.
 GLR: that over all onsets and the p meters for the true size, against ``log (p gamma)``: the run lengths of
 both to a false alarm are at least gamma, as that of `modal`. Ratio: named by `modal` over GLR.
 
@@ -117,7 +117,7 @@ class World:
     Parameters
     ----------
     front
-        Design of the default monitor.
+        Design of the sequential monitor.
     seed
         Chooses everything random.
     """
@@ -436,7 +436,7 @@ class Honest:
 
 
 def honest(feeder: str, seed: int, ticks: int = 240) -> Honest:
-    """AC power flow as the truth; the core beside the default monitor."""
+    """AC power flow as the truth; the core beside the sequential monitor."""
     trial = Trial(
         site(feeder), seed=seed, duration_s=float(ticks), meters=TrialMeterErrors.REAL, load_error=LoadError()
     )

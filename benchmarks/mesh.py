@@ -1,5 +1,7 @@
 """Feeders with closed ties: the model against the AC power flow, and a third of the meters lying.
 
+The monitor is `sequential`.
+
 `python -m benchmarks.mesh`; the numbers of docs/theory-mesh.md. Half a minute.
 """
 
@@ -17,7 +19,7 @@ import numpy as np
 
 from feeders.format.tables import FeederTables, LineRow
 from feeders.model.site import Site, from_tables, load
-from feeders.registry import design
+from feeders.registry import SEQUENTIAL, choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.powerflow import power_flow
 from feeders.simulation.trial import LoadError, Trial, judge
@@ -128,7 +130,7 @@ def named(site: Site, trick: AttackKind, percent: float) -> str:
     for seed in SEEDS:
         lie = AttackSpec(trick, count, percent, onset_s=10.0)
         trial = Trial(site, seed, 30.0, load_error=LoadError(kw, kw / 3.0), lie=lie)
-        outcomes.append(judge(design(trial.stated), trial, settling_s=3.0))
+        outcomes.append(judge(design(choose(trial.stated, estimator=SEQUENTIAL)), trial, settling_s=3.0))
     missed, accused = sum(o.missed for o in outcomes), sum(int(o.accused.sum()) for o in outcomes)
     slowest = max(float(o.delay_s.max()) for o in outcomes)
     step = np.median(np.concatenate([o.step_ms for o in outcomes]))
@@ -143,7 +145,9 @@ def clean(site: Site) -> str:
     """One row without manipulation: honest meters named, and the seconds without an answer."""
     kw = LOAD_KW[site.feeder.name]
     trials = [Trial(site, seed, 30.0, load_error=LoadError(kw, kw / 3.0)) for seed in SEEDS]
-    outcomes = [judge(design(trial.stated), trial, settling_s=3.0) for trial in trials]
+    outcomes = [
+        judge(design(choose(trial.stated, estimator=SEQUENTIAL)), trial, settling_s=3.0) for trial in trials
+    ]
     accused = sum(int(o.accused.sum()) for o in outcomes)
     undecided = sum(int(o.undecided[15:].sum()) for o in outcomes)
     return f"| {site.feeder.name} | nobody | | | | {accused} | {undecided} undecided |"

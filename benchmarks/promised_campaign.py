@@ -32,6 +32,7 @@ from feeders.studies.running import Here, Processes
 
 FEEDER, LIES, LIARS = "simbench-lv-rural1", 10_000, 2
 PLAN = CampaignPlan(
+    estimator="sequential",  # the guarantees are those of its limits
     together=3,
     duration_s=18.0,
     onset_s=(4.0, 6.0),

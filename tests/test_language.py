@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-DEFAULT_MONITOR = "sequential"
+DEFAULT_MONITOR = "modal"
 """Folder of the default monitor; its inside is counted as an area of its own."""
 
 QUESTION = re.compile(r"(What|Who|Whom|Whose|Whether|How|Which|Where|When|Why|If)\b")

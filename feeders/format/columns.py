@@ -428,7 +428,7 @@ class LoadDefaults:
 class MonitorDefaults:
     """Settings of the monitor."""
 
-    estimator: Annotated[str, Text("estimator family", choices=ESTIMATORS)] = "sequential"
+    estimator: Annotated[str, Text("estimator family", choices=ESTIMATORS)] = "modal"
     max_attacked: Annotated[
         int, Whole("manipulated meters to withstand; `sequential`, `modal`: a third", 0, 1000)
     ] = 1

@@ -82,6 +82,8 @@ def sources(site: Site, plan: CampaignPlan, given: Mapping[str, object]) -> str:
     some = {option for option, value in given.items() if value is not None}
     asked = "--step", "--estimator", "--alarms-per-year"
     step, estimator, rate = (option if option in some else FILES for option in asked)
+    if "--promised" in some and "--estimator" not in some:
+        estimator = "--promised"
     rates = ", ".join(f"{each:g}" for each in plan.alarms_per_year)
     loads = [option for option in ("--load-error-kw", "--load-error-kvar") if option in some]
     doubt, base = load_doubt(plan.trial(site, plan.moment(0)).stated), site.feeder.base_kva
@@ -123,7 +125,7 @@ Promised = Annotated[
     typer.Option(
         "--promised",
         help="Attacks of the sizes that `study detectable` finds, for M = 2, in place of the six kinds, and "
-        "the number of its guarantees that hold.",
+        "the number of its guarantees that hold; the estimator is sequential if --estimator states no other.",
     ),
 ]
 Liars = Annotated[
@@ -263,7 +265,7 @@ def campaign(
                 places=places,
                 design=drawn,
                 seasons=seasons,
-                estimator=estimator,
+                estimator=estimator or (PROMISING if promised else None),
                 alarms_per_year=tuple(sorted(set(alarms_per_year))) if alarms_per_year else None,
                 learn_s=3600.0 * learned,
                 settings=tuple(settings),
@@ -274,6 +276,7 @@ def campaign(
         given = {
             "--step": step,
             "--estimator": estimator,
+            "--promised": promised or None,
             "--alarms-per-year": alarms_per_year,
             "--load-error-kw": load_error_kw,
             "--load-error-kvar": load_error_kvar,
@@ -288,6 +291,9 @@ def campaign(
         write_tables(out, "campaign", found.tables)
         output.end(site, found, plot)
 
+
+PROMISING = "sequential"
+"""Estimator of the guarantees of `study detectable`; a more sensitive one names attacks of hidden sizes."""
 
 NO_LIES = (
     "one scenario of each scene is the control scenario without an attack; expected --scenarios and "

@@ -35,6 +35,7 @@ from tests.service.running import free_port
 BUSBAR = ""
 FEEDER = "simbench-lv-rural1"
 SILENCE_S = 10.0
+STARTED_S = 4.0  # the transient of the observer is small beside the error at which a reading stands out
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,8 @@ def test_a_meter_that_falls_silent_is_data_loss_and_never_clean(tmp_path: Path) 
         for state in fleet.pour(samples):
             t = state["t"] - START
             unseen = [m["meter"] for m in state["meters"] if not m["seen"]]
-            assert state["verdict"] == ("undecided" if unseen or t < 2 else "clean"), (t, state["reason"])
+            expected = "undecided" if unseen or t < STARTED_S else "clean"
+            assert state["verdict"] == expected, (t, state["reason"])
             assert unseen == (["m05"] if 22 <= t < 45 else []), t
             silent = [s["meter"] for s in state["silent"]]
             assert silent == (["m05"] if 19 + SILENCE_S < t < 45 else []), t
@@ -96,10 +98,10 @@ def test_a_meter_that_falls_silent_is_data_loss_and_never_clean(tmp_path: Path) 
     assert 30 <= alarm["t_raised"] - START <= 19 + SILENCE_S + 4
 
 
-@pytest.mark.canary("sequential")
-@pytest.mark.parametrize("estimator", ["sequential", "exact-bank"])
+@pytest.mark.canary("modal")
+@pytest.mark.parametrize("estimator", ["modal", "sequential", "exact-bank"])
 def test_a_silent_busbar_is_data_loss(estimator: str, tmp_path: Path) -> None:
-    """The bank cannot judge without it; the sequential monitor estimates it along with everything else."""
+    """The bank cannot judge without it; the other monitors estimate it along with everything else."""
     samples = sampled(load(FEEDER), 60)
     samples[20:45] = [without(s, BUSBAR) for s in samples[20:45]]
     with serve(FEEDER, tmp_path, "--estimator", estimator) as live, Fleet(live) as fleet:
@@ -108,7 +110,7 @@ def test_a_silent_busbar_is_data_loss(estimator: str, tmp_path: Path) -> None:
             assert not any(meter["suspect"] for meter in state["meters"])
             if 22 <= t < 45 and estimator == "exact-bank":
                 assert (state["verdict"], state["cause"]) == ("undecided", "no-busbar"), t
-            elif not (t < 2 or 45 <= t < 50):  # It settles at the start, and once the busbar is back.
+            elif not (t < STARTED_S or 45 <= t < 50):  # It settles at the start, and once the busbar is back.
                 assert state["verdict"] == "clean", (t, state["reason"])
         (alarm,) = until(lambda: [a for a in live.alarms() if a["state"] == "cleared"])
     assert (alarm["kind"], alarm["meter"]) == ("data-loss", "substation")
@@ -445,7 +447,7 @@ def test_a_feeder_put_while_running_is_watched_and_the_other_goes_on(tmp_path: P
             for (sample, one), (_, two) in both:
                 assert one["verdict"] == "clean"
                 assert (one["feeder"], two["feeder"]) == (FEEDER, "second")
-                assert two["verdict"] == "clean" or sample.t - START < 12
+                assert two["verdict"] == "clean" or sample.t - START < 10.0 + STARTED_S
             replies = fleet.session.get("gridsec/*/estimate", timeout=5.0)
             told = {str(r.ok.key_expr): json.loads(r.ok.payload.to_bytes()) for r in replies if r.ok}
         assert {state["feeder"] for state in told.values()} == {FEEDER, "second"}

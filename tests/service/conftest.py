@@ -280,7 +280,7 @@ class SmallService:
         open_ones = [m for m in village.meters if m in self.learning]
         now = self.reports[name].t if name in self.reports else None
         return TypeAdapter(CommissioningProgress).validate_python({
-            "feeder": name, "estimator": "sequential", "state": "learning" if open_ones else "learned",
+            "feeder": name, "estimator": "modal", "state": "learning" if open_ones else "learned",
             "t": now, "tick_s": 1.0, "needed_s": 86400.0, "gathered_s": 18_000.0 if open_ones else None,
             "since": T0 - 18_000.0 if open_ones else None, "expected": T0 + 68_400.0 if open_ones else None,
             "learned_at": None if len(open_ones) == len(village.meters) else T0 - 9e5,

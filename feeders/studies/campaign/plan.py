@@ -157,7 +157,7 @@ class CampaignPlan:
     lying_s: float = 300.0  # largest duration of attacks
     settling_s: float = 10.0  # time after an onset without errors of the voltage
     seasons: tuple[Season, ...] = tuple(Season)
-    estimator: str = "sequential"
+    estimator: str = "modal"
     alarms_per_year: tuple[float, ...] = (1.0,)  # every scenario is monitored once for each
     learn_s: float = 0.0  # honest time before each scene with readings every `learn_step_s`; 0: no learning
     settings: tuple[tuple[str, float], ...] = ()  # other settings of the feeder's `[monitor]`

@@ -1,4 +1,4 @@
-"""Default monitor: one observer, correlated load uncertainty, evidence on several time scales.
+"""Sequential monitor: one observer, correlated load uncertainty, evidence on several time scales.
 
     design(plant, doubt=..., step_s=...) -> SequentialDesign
     init(design, t) -> SequentialState

@@ -523,6 +523,12 @@ def test_document_names_every_column_and_its_meaning() -> None:
     assert all(f"| `{suspicion}` |" in text for suspicion in SUSPICIONS)
 
 
+def test_document_states_the_default_estimator() -> None:
+    text = (Path(__file__).parents[3] / "docs" / "feeder-format.md").read_text(encoding="utf-8")
+    (row,) = (line for line in text.splitlines() if line.startswith("| `estimator` |"))
+    assert row.endswith(f"| `{MonitorDefaults().estimator}` |")
+
+
 def test_examples_of_the_document_are_valid(tmp_path: Path) -> None:
     text = (Path(__file__).parents[3] / "docs" / "feeder-format.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```(toml|csv|json)\n(.*?)```", text, flags=re.DOTALL)

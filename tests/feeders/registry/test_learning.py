@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import from_tables, load
-from feeders.registry import SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.registry import MODAL, SEQUENTIAL, DesignedEstimator, choose, design
 from gridsec.estimators.sequential.meter_bias import class_only, learn, no_readings, ready_meters
 
 
@@ -51,7 +51,8 @@ def test_errors_that_come_and_go_are_learned_away_and_lasting_ones_are_not() -> 
 def test_families_that_learn_nothing_say_so() -> None:
     site = load("simbench-lv-rural1")
     meta = site.tables.meta
-    assert meta.monitor.estimator == SEQUENTIAL
+    assert meta.monitor.estimator == MODAL
+    assert all(design(choose(site, estimator=name)).bias_learning is not None for name in (MODAL, SEQUENTIAL))
     for other in ("exact-bank", "weighted-least-squares", "set-search"):
         made = design(choose(site, estimator=other))
         assert isinstance(made, DesignedEstimator)

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks._stealthy import linear_tests, misfit_limit, within_misfit
 from feeders.model.site import Site, Snapshot, from_tables, load, to_frame
-from feeders.registry import DesignedEstimator, design
+from feeders.registry import MODAL, SEQUENTIAL, DesignedEstimator, choose, design
 from feeders.simulation.demand import Variation
 from feeders.simulation.scenario import START, Scenario, SimulatedTick, simulate, snapshots
 from gridsec.arrays import Bools, Floats
@@ -33,8 +33,8 @@ def site() -> Site:
 
 
 @cache
-def watcher() -> DesignedEstimator:
-    return design(site())
+def watcher(estimator: str) -> DesignedEstimator:
+    return design(choose(site(), estimator=estimator))
 
 
 @cache
@@ -59,7 +59,8 @@ def street(count: int, seed: int) -> Bools:
 
 
 def design_of() -> SequentialDesign:
-    found = watcher().design
+    """The design whose tests limit the lie."""
+    found = watcher(SEQUENTIAL).design
     assert isinstance(found, SequentialDesign)
     return found
 
@@ -82,26 +83,41 @@ def late(said: Snapshot, gone: Bools) -> Snapshot:
     return replace(said, p_age_s=np.where(gone, 60.0, np.nan))
 
 
+@cache
+def largest(seed: int, how: Callable[[Snapshot, Bools], Snapshot]) -> Floats:
+    """The largest lie of a street within the limits of the sequential monitor, squared pu."""
+    model, withhold = design_of(), street(LIARS, seed)
+    state = watcher(SEQUENTIAL).init(START)
+    for sample, said in played(seed):
+        age = sample.t - START
+        if age == LIE_S:
+            break
+        told = how(said, withhold & (age >= WITHHELD_S))
+        state, _, _ = watcher(SEQUENTIAL).step(state, to_frame(site(), told))
+    assert isinstance(state, SequentialState)
+    room = SHARE * (misfit_limit(model) - withhold.size)
+    lie = within_misfit(linear_tests(model, state), np.flatnonzero(withhold), room, share=SHARE).lie
+    assert np.abs(lie).max() > 0.02
+    return lie
+
+
 def watch(
+    estimator: str,
     seed: int,
     withhold: Bools,
     *,
     lying: bool,
     how: Callable[[Snapshot, Bools], Snapshot] = omitted,
 ) -> Iterator[tuple[SimulatedTick, Estimate, Verdict]]:
-    """Answers from the first withheld power on; the lie is the largest within the monitor's own limits."""
-    model, at = design_of(), site().customer_volt[site().meters]
-    state, lie = watcher().init(START), np.zeros(withhold.size)
+    """Answers from the first withheld power on, with the lie of `largest`."""
+    at = site().customer_volt[site().meters]
+    state = watcher(estimator).init(START)
     for sample, said in played(seed):
         age = sample.t - START
-        if lying and age == LIE_S:
-            assert isinstance(state, SequentialState)
-            room = SHARE * (misfit_limit(model) - withhold.size)
-            lie = within_misfit(linear_tests(model, state), np.flatnonzero(withhold), room, share=SHARE).lie
-            assert np.abs(lie).max() > 0.02
+        lie = largest(seed, how) if lying and age >= LIE_S else np.zeros(withhold.size)
         told = how(said, withhold & (age >= WITHHELD_S))
         v = at * np.sqrt(np.maximum((said.v_volt / at) ** 2 + lie, 0.0))
-        state, estimate, verdict = watcher().step(state, to_frame(site(), replace(told, v_volt=v)))
+        state, estimate, verdict = watcher(estimator).step(state, to_frame(site(), replace(told, v_volt=v)))
         if age >= WITHHELD_S:
             yield sample, estimate, verdict
 
@@ -111,12 +127,15 @@ def error(sample: SimulatedTick, estimate: Estimate) -> Floats:
     return np.asarray(np.abs(estimate.v2 - (sample.v_volt / site().customer_volt) ** 2))
 
 
-@pytest.mark.canary("1")
+@pytest.mark.canary("sequential-1", "modal-1")
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_colluding_meters_that_withhold_powers_are_never_clean_beyond_the_bound(seed: int) -> None:
+@pytest.mark.parametrize("estimator", [SEQUENTIAL, MODAL])
+def test_colluding_meters_that_withhold_powers_are_never_clean_beyond_the_bound(
+    estimator: str, seed: int
+) -> None:
     """A third of the meters: voltages 9 to 15 V off, and no single limit shows it."""
     lied, off = 0, []
-    for sample, estimate, verdict in watch(seed, street(LIARS, seed), lying=True):
+    for sample, estimate, verdict in watch(estimator, seed, street(LIARS, seed), lying=True):
         wrong = error(sample, estimate)
         assert (wrong <= estimate.bound).all()
         assert verdict.decision is not Decision.CLEAN or (wrong <= 4.0 * estimate.std).all()
@@ -128,13 +147,14 @@ def test_colluding_meters_that_withhold_powers_are_never_clean_beyond_the_bound(
     assert max(off) < 4.0
 
 
-@pytest.mark.canary("late")
+@pytest.mark.canary("sequential-late", "modal-late")
 @pytest.mark.parametrize("how", [absurd, beyond, late])
+@pytest.mark.parametrize("estimator", [SEQUENTIAL, MODAL])
 def test_powers_that_are_worth_nothing_are_as_good_as_withheld_ones(
-    how: Callable[[Snapshot, Bools], Snapshot],
+    estimator: str, how: Callable[[Snapshot, Bools], Snapshot]
 ) -> None:
     """The same meters report powers that nothing connected can have, or old ones."""
-    for sample, estimate, verdict in watch(0, street(LIARS, 0), lying=True, how=how):
+    for sample, estimate, verdict in watch(estimator, 0, street(LIARS, 0), lying=True, how=how):
         if sample.t - START >= LIE_S:
             wrong = error(sample, estimate)
             assert verdict.decision is not Decision.CLEAN
@@ -142,10 +162,11 @@ def test_powers_that_are_worth_nothing_are_as_good_as_withheld_ones(
             assert (wrong <= 4.0 * estimate.std).all()
 
 
-@pytest.mark.canary("1-0")
+@pytest.mark.canary("sequential-1-0", "modal-1-0")
 @pytest.mark.parametrize(("count", "seed"), [(1, 0), (1, 1), (1, 2), (5, 3), (LIARS, 4)])
-def test_withheld_powers_of_honest_meters_accuse_nobody(count: int, seed: int) -> None:
-    for sample, estimate, verdict in watch(seed, street(count, seed), lying=False):
+@pytest.mark.parametrize("estimator", [SEQUENTIAL, MODAL])
+def test_withheld_powers_of_honest_meters_accuse_nobody(estimator: str, count: int, seed: int) -> None:
+    for sample, estimate, verdict in watch(estimator, seed, street(count, seed), lying=False):
         wrong = error(sample, estimate)
         assert verdict.decision is not Decision.ATTACKED
         assert not verdict.suspects.any()
@@ -153,9 +174,10 @@ def test_withheld_powers_of_honest_meters_accuse_nobody(count: int, seed: int) -
         assert (wrong <= 5.0 * estimate.std).all()
 
 
-def test_the_reason_names_the_setting_and_a_larger_one_is_clean() -> None:
+@pytest.mark.parametrize("estimator", [SEQUENTIAL, MODAL])
+def test_the_reason_names_the_setting_and_a_larger_one_is_clean(estimator: str) -> None:
     """The same readings, once with no precision asked for: CLEAN, and the same estimate."""
-    meta = site().tables.meta
+    meta = choose(site(), estimator=estimator).tables.meta
     loose = design(
         from_tables(
             replace(
@@ -164,11 +186,11 @@ def test_the_reason_names_the_setting_and_a_larger_one_is_clean() -> None:
         )
     )
     withhold = np.ones(site().meters.size, dtype=np.bool_)
-    tight, state = watcher().init(START), loose.init(START)
+    tight, state = watcher(estimator).init(START), loose.init(START)
     for sample, said in played(0)[:30]:
         gone = withhold & (sample.t - START >= WITHHELD_S)
         frame = to_frame(site(), replace(said, p_kw=np.where(gone, np.nan, said.p_kw)))
-        tight, one, verdict = watcher().step(tight, frame)
+        tight, one, verdict = watcher(estimator).step(tight, frame)
         state, other, answer = loose.step(state, frame)
         np.testing.assert_array_equal(one.v2, other.v2)
     assert (verdict.decision, verdict.cause) == (Decision.UNDECIDED, Cause.MISSING_POWERS)
@@ -177,23 +199,32 @@ def test_the_reason_names_the_setting_and_a_larger_one_is_clean() -> None:
     assert answer.decision is Decision.CLEAN
 
 
+OMITTED, OUT_OF_RANGE = "No active power from ", "The active power of {} is beyond the declared range."
+
+
 @pytest.mark.parametrize(
-    ("how", "sentence"),
+    ("estimator", "how", "sentence"),
     [
-        (omitted, "No active power from "),
-        (late, "The active power of {} is older than the voltage."),
-        (beyond, "The active power of {} is beyond the declared range."),
-        (absurd, "The active power of {} is beyond the declared range."),
+        (SEQUENTIAL, omitted, OMITTED),
+        # With `modal` powers 60 s old leave 0.3 %, less than the deviation asked for: the verdict is CLEAN.
+        (SEQUENTIAL, late, "The active power of {} is older than the voltage."),
+        (SEQUENTIAL, beyond, OUT_OF_RANGE),
+        (SEQUENTIAL, absurd, OUT_OF_RANGE),
+        (MODAL, omitted, OMITTED),
+        (MODAL, beyond, OUT_OF_RANGE),
+        (MODAL, absurd, OUT_OF_RANGE),
     ],
 )
 def test_the_reason_states_the_origin_of_the_power(
-    how: Callable[[Snapshot, Bools], Snapshot], sentence: str
+    estimator: str, how: Callable[[Snapshot, Bools], Snapshot], sentence: str
 ) -> None:
     """Every power is missing in the same way."""
     starts, _, ends = sentence.partition("{}")
     reasons = {
         verdict.reason
-        for _, _, verdict in watch(0, np.ones(site().meters.size, dtype=np.bool_), lying=False, how=how)
+        for _, _, verdict in watch(
+            estimator, 0, np.ones(site().meters.size, dtype=np.bool_), lying=False, how=how
+        )
         if verdict.cause is Cause.MISSING_POWERS
     }
     assert reasons
@@ -201,23 +232,29 @@ def test_the_reason_states_the_origin_of_the_power(
     assert all(any(name in reason for name in design_of().names) for reason in reasons)
 
 
-def test_one_power_that_comes_back_is_forgotten() -> None:
+@pytest.mark.parametrize("estimator", [SEQUENTIAL, MODAL])
+def test_one_power_that_comes_back_is_forgotten(estimator: str) -> None:
     """A minute after the last withheld power the answer is that of a monitor with all powers."""
     gone = street(LIARS, 1)
-    state, beside = watcher().init(START), watcher().init(START)
+    state, beside = watcher(estimator).init(START), watcher(estimator).init(START)
     for sample, said in played(1):
         missing = gone & (WITHHELD_S <= sample.t - START < WITHHELD_S + 10.0)
         frame = to_frame(site(), replace(said, p_kw=np.where(missing, np.nan, said.p_kw)))
-        state, estimate, verdict = watcher().step(state, frame)
-        beside, usual, _ = watcher().step(beside, to_frame(site(), said))
+        state, estimate, verdict = watcher(estimator).step(state, frame)
+        beside, usual, _ = watcher(estimator).step(beside, to_frame(site(), said))
     assert verdict.decision is Decision.CLEAN
-    np.testing.assert_allclose(estimate.std, usual.std, rtol=1e-6)
-    assert isinstance(state, SequentialState)
-    assert state.uncertainty.vouched.all()
-    assert state.vouched_posteriors == (None,) * len(state.posteriors)
+    # The filter of `modal` keeps that ten ticks told less: 1.2e-6 a minute later.
+    np.testing.assert_allclose(estimate.std, usual.std, rtol=1e-5 if estimator == MODAL else 1e-6)
+    if estimator == SEQUENTIAL:
+        assert isinstance(state, SequentialState)
+        assert state.uncertainty.vouched.all()
+        assert state.vouched_posteriors == (None,) * len(state.posteriors)
 
 
-def test_a_customer_without_a_meter_and_one_whose_file_expects_no_reading_are_as_before() -> None:
+@pytest.mark.parametrize("estimator", [SEQUENTIAL, MODAL])
+def test_a_customer_without_a_meter_and_one_whose_file_expects_no_reading_are_as_before(
+    estimator: str,
+) -> None:
     """`p_std_kw` as wide as the range states that no power is expected: no verdict asks for one."""
     tables = site().tables
     rows = tuple(
@@ -225,7 +262,7 @@ def test_a_customer_without_a_meter_and_one_whose_file_expects_no_reading_are_as
         for k, row in enumerate(tables.customers)
     )
     stated = from_tables(replace(tables, customers=rows))
-    made = design(stated)
+    made = design(choose(stated, estimator=estimator))
     state, keep = made.init(START), np.arange(site().meters.size) != 3
     for _, said in played(2)[:30]:
         p_kw = said.p_kw.copy()
@@ -236,5 +273,5 @@ def test_a_customer_without_a_meter_and_one_whose_file_expects_no_reading_are_as
         assert frame.p_origin[[3, 5]].tolist() == [PowerOrigin.UNREAD] * 2
         state, _, verdict = made.step(state, frame)
     assert verdict.decision is Decision.CLEAN
-    assert isinstance(state, SequentialState)
-    assert state.uncertainty.vouched.all()
+    uncertainty = state.uncertainty if estimator == SEQUENTIAL else state.front.uncertainty
+    assert uncertainty.vouched.all()

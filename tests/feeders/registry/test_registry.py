@@ -10,7 +10,7 @@ import pytest
 
 from feeders.format.columns import ESTIMATORS
 from feeders.model.site import from_tables, load, to_frame
-from feeders.registry import DIRECT, FAMILIES, LMI, SEQUENTIAL, choose, design, lmi_options
+from feeders.registry import DIRECT, FAMILIES, LMI, MODAL, choose, design, lmi_options
 from feeders.simulation.powerflow import PowerFlow
 from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
 from gridsec.errors import DesignInfeasible, FeederInvalid, NotObservable
@@ -28,7 +28,7 @@ def test_the_file_is_the_default_and_can_be_overruled() -> None:
     other = choose(site, estimator=LMI, max_attacked=2)
     assert (other.tables.meta.monitor.estimator, other.tables.meta.monitor.max_attacked) == (LMI, 2)
     assert other.digest != site.digest
-    assert choose(other, estimator=SEQUENTIAL, max_attacked=1).digest == site.digest
+    assert choose(other, estimator=MODAL, max_attacked=1).digest == site.digest
 
 
 def test_every_name_that_a_file_may_hold_has_a_family() -> None:
@@ -36,7 +36,7 @@ def test_every_name_that_a_file_may_hold_has_a_family() -> None:
     assert all(family.summary for family in FAMILIES.values())
 
 
-@pytest.mark.canary("sequential", "unknown-input")
+@pytest.mark.canary("sequential", "modal", "unknown-input")
 @pytest.mark.parametrize("name", [name for name in ESTIMATORS if name != LMI])
 def test_an_estimator_watches_three_phases(name: str) -> None:
     site = choose(from_tables(unbalanced(SMALL)), estimator=name)

@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from feeders.model.site import load, names, to_frame
-from feeders.registry import design
+from feeders.model.site import Site, load, names, to_frame
+from feeders.registry import MODAL, SEQUENTIAL, choose, design
 from feeders.simulation.scenario import START
 from feeders.simulation.trial import AttackKind, AttackSpec, LoadError, Trial, TrialMeterErrors, frames
 from gridsec.attack import Bias
 from gridsec.estimators import sequential
 from gridsec.interface import Cause, Decision, Frame, Verdict
-from tests.feeders.registry.test_adversarial import HIGH, LOW, Ends, World, default
+from tests.feeders.registry.test_adversarial import HIGH, LOW, Ends, World, of_sequential
 
 WITH_INVERTERS = [name for name in names() if load(name).droop.tau.size]
 
@@ -36,7 +36,7 @@ class Reporting(World):
 @pytest.mark.parametrize("name", WITH_INVERTERS)
 @pytest.mark.parametrize("step_s", [1.0, 900.0])
 def test_honest_errors_at_their_ends_never_accuse_an_inverter(name: str, step_s: float) -> None:
-    made = default(name, step_s)
+    made = of_sequential(name, step_s)
     for ends in (HIGH, LOW, Ends(1, 1, 1, 1)):
         for v0, load_, sun in ((0.95, 1.0, 0.0), (1.05, 0.1, 1.0)):
             for wrong in (-1.0, 1.0):
@@ -53,19 +53,37 @@ def test_honest_errors_at_their_ends_never_accuse_an_inverter(name: str, step_s:
                     assert (np.abs(estimate.v2 - true) <= estimate.bound).all()
 
 
-@pytest.mark.parametrize(("count", "liar"), [(1, 2), (2, None), (2, 2)])
-def test_all_are_told_of_whoever_else_lies(count: int, liar: int | None) -> None:
-    """Two inverters off their curves are both in an explanation; a named meter hides none of them."""
+def off_their_curves(estimator: str, count: int, liar: int | None) -> tuple[Site, set[int], Verdict]:
+    """A minute of inverters off their curves and of a false meter: the last verdict, and the owners."""
     site = load("cigre-lv")
     lie = AttackSpec(AttackKind.INVERTER, count, 100.0)
     trial = Trial(site, 0, duration_s=60.0, load_error=LoadError(0.1, 0.05), lie=lie, report_q=True)
     honest = trial.scenario
     owners = set(site.droop.customer[honest.inverter_attacks[0].inverters].tolist())
     attacks = () if liar is None else (Bias(np.array([liar]), START + 30.0, START + 90.0, np.array([0.03])),)
-    watcher = design(trial.stated)
+    watcher = design(choose(trial.stated, estimator=estimator))
     state = watcher.init(0.0)
     for frame, _ in frames(trial, replace(honest, attacks=attacks)):
         state, _, verdict = watcher.step(state, frame)
+    return site, owners, verdict
+
+
+@pytest.mark.parametrize(("count", "liar"), [(1, 2), (2, None), (2, 2)])
+def test_the_default_names_an_inverter_and_tells_of_the_other(count: int, liar: int | None) -> None:
+    """The voltages decide for one of two inverters: it is named where `sequential` is UNDECIDED."""
+    site, owners, verdict = off_their_curves(MODAL, count, liar)
+    assert verdict.decision is Decision.ATTACKED
+    assert np.flatnonzero(verdict.suspects).tolist() == ([] if liar is None else [liar])
+    named = set(site.droop.customer[verdict.inverters].tolist())
+    assert len(named) == 1
+    assert named <= owners
+    assert all(site.feeder.customers[owner] in verdict.reason for owner in owners)
+
+
+@pytest.mark.parametrize(("count", "liar"), [(1, 2), (2, None), (2, 2)])
+def test_all_are_told_of_whoever_else_lies(count: int, liar: int | None) -> None:
+    """Two inverters off their curves are both in an explanation; a named meter hides none of them."""
+    site, owners, verdict = off_their_curves(SEQUENTIAL, count, liar)
     assert verdict.decision is (Decision.UNDECIDED if liar is None else Decision.ATTACKED)
     assert np.flatnonzero(verdict.suspects).tolist() == ([] if liar is None else [liar])
     # A manipulated majority of the six meters may explain the readings besides, with the named meter in it.
@@ -85,6 +103,7 @@ def test_all_are_told_of_whoever_else_lies(count: int, liar: int | None) -> None
 def watched(
     name: str,
     *,
+    estimator: str | None = None,
     seed: int = 0,
     meters: TrialMeterErrors = TrialMeterErrors.SITE,
     error: LoadError | None = None,
@@ -99,19 +118,27 @@ def watched(
         lie=AttackSpec(AttackKind.INVERTER, 1, 100.0),
         report_q=True,
     )
-    watcher = design(trial.stated)
+    watcher = design(choose(trial.stated, estimator=estimator))
     state = watcher.init(0.0)
     for frame, truth in frames(trial):
         state, _, verdict = watcher.step(state, frame)
         yield frame, verdict, int(np.argmax(truth.inverters)) if truth.inverters.any() else -1
 
 
-@pytest.mark.canary("0-cigre-lv", "1-simbench-lv-rural1")
+@pytest.mark.canary(
+    "0-sequential-cigre-lv",
+    "1-sequential-simbench-lv-rural1",
+    "0-modal-cigre-lv",
+    "1-modal-simbench-lv-rural1",
+)
 @pytest.mark.parametrize("name", [name for name in WITH_INVERTERS if name != "kerber-vorstadtnetz"])
+@pytest.mark.parametrize("estimator", [SEQUENTIAL, MODAL])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_an_inverter_off_its_curve_is_never_clean_and_nobody_else_is_accused(name: str, seed: int) -> None:
+def test_an_inverter_off_its_curve_is_never_clean_and_nobody_else_is_accused(
+    name: str, estimator: str, seed: int
+) -> None:
     site, since = load(name), 0
-    for _, verdict, which in watched(name, seed=seed):
+    for _, verdict, which in watched(name, estimator=estimator, seed=seed):
         assert not verdict.suspects.any()
         assert not np.delete(verdict.inverters, max(which, 0)).any()
         since += which >= 0
@@ -198,7 +225,7 @@ def test_nothing_of_a_replaced_meter_counts() -> None:
     site = load("cigre-lv")
     trial = Trial(site, 3, duration_s=30.0, load_error=LoadError(0.1, 0.05), report_q=True)
     c = int(site.droop.customer[1])
-    made, which = default("cigre-lv", 1.0), load("cigre-lv").meters == c
+    made, which = of_sequential("cigre-lv", 1.0), load("cigre-lv").meters == c
     state = sequential.init(made, 0.0)
     for k, (frame, _) in enumerate(frames(trial)):
         q_net = frame.q_net.copy()

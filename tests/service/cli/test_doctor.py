@@ -101,7 +101,7 @@ def test_a_machine_in_order(tmp_path: Path, monkeypatch: Patch, capsys: Capture)
     assert found["clock"][0][1].endswith("s after the newest tick of the database")
     assert found["http"] == [("ok", f"127.0.0.1:{http} is free")]
     assert found["zenoh"][1] == ("ok", f"{zenoh} answers")
-    assert found["feeder"][0][1].startswith(f"{FEEDER}: 13 meters, sequential, M = ")
+    assert found["feeder"][0][1].startswith(f"{FEEDER}: 13 meters, modal, M = ")
 
 
 def test_every_problem_has_its_line(tmp_path: Path, monkeypatch: Patch, capsys: Capture) -> None:

@@ -378,7 +378,7 @@ def test_a_wrong_inverter_is_recorded_and_raises_its_alarm(gridsec: Run, tmp_pat
     folder, file = tmp_path / FEEDER, tmp_path / "day.parquet"
     shutil.copytree(CASES.parents[1] / "data/feeders" / FEEDER, folder)
     meta = folder / "feeder.toml"
-    text = meta.read_text().replace('estimator = "sequential"', 'estimator = "unknown-input"')
+    text = meta.read_text().replace('estimator = "modal"', 'estimator = "unknown-input"')
     meta.write_text(text.replace("max_attacked = 2", "max_attacked = 1"))
     made = gridsec(
         "simulate", str(folder), "--out", str(file), "--duration", "40", "--seed", "4", "--report-q",

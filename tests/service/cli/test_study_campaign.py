@@ -30,7 +30,7 @@ def test_tables_are_printed_and_written(
     some = ("--kind", "bias:3,5", "--liars", "1", "--place", "random", "--out", str(out))
     code, told, _ = run(monkeypatch, capsys, *FEW, *some, "--journal", str(journal))
     assert code == 0
-    assert "cigre-lv: 3 scenarios of 30 s monitored by sequential" in told
+    assert "cigre-lv: 3 scenarios of 30 s monitored by modal" in told
     assert "By kind and size" in told
     found = pd.read_csv(out / "campaign-scenarios.csv")
     assert found["kind"].tolist() == ["clean", "bias", "bias"]
@@ -53,6 +53,7 @@ def test_promises_are_played_and_counted(
     code, told, _ = run(monkeypatch, capsys, *words)
     assert code == 0
     assert "Guarantees of `study detectable`" in told
+    assert "monitored by sequential (--promised)" in told
     kept = pd.read_csv(tmp_path / "out" / "campaign-promises.csv").set_index("promise")
     assert kept["lies"].to_dict() == {"hidden": 4, "named": 4}
     assert kept["broken"].sum() == 0

@@ -140,7 +140,8 @@ def test_campaign(given: Given) -> None:
     assert ran.number(r"named \d+ of (\d+) manipulated") == len(liars)
     assert ran.number(r"median delay ([\d.]+) s") == delays[np.isfinite(delays)].median()
     low = ran.table("false_names")["named_low"][0]
-    assert ran.number(r"at least ([\d.]+) %") == pytest.approx(100.0 * low, abs=0.06)
+    # A lower limit is rounded down.
+    assert 0.0 <= 100.0 * low - ran.number(r"at least ([\d.]+) %") < 0.1
     assert ran.number(r"accusations in (\d+) of 4") == (scenarios["falsely_named"] != "").sum()
     share = scenarios["undecided_s"].sum() / scenarios["watched_s"].sum()
     assert ran.number(r"UNDECIDED for ([\d.]+) %") == pytest.approx(100.0 * share, abs=0.06)

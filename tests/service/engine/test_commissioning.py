@@ -533,7 +533,7 @@ def live(site: Site, tmp_path_factory: pytest.TempPathFactory) -> Iterator[InPro
 
 def test_rest_tells_what_was_learned(live: InProcess) -> None:
     found = live.get(f"/api/v1/feeders/{FEEDER}/commissioning")
-    assert (found["estimator"], found["needed_s"], found["tick_s"]) == ("sequential", NEEDED, 1.0)
+    assert (found["estimator"], found["needed_s"], found["tick_s"]) == ("modal", NEEDED, 1.0)
     assert (found["note"], found["held"], found["restored"]) == ("", False, False)
     assert [m["meter"] for m in found["meters"]] == [f"m{k:02d}" for k in range(1, 14)]
     for meter in found["meters"]:

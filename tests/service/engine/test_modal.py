@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from feeders.model.site import Site, load
-from feeders.registry import MODAL, choose
+from feeders.registry import MODAL, SEQUENTIAL, choose
 from feeders.simulation.plant import Channel
 from feeders.simulation.scenario import Scenario, SimulatedReading, by_arrival, simulate
 from gridsec.attack import Scaling
@@ -100,3 +101,68 @@ def test_named_meters_and_learned_errors_survive_a_restart(
         assert {told.suspects(k) for k in range(len(told.estimates))} == {LIARS}
         live.recommission(FEEDER, [LIARS[0]], "Ada", "new meter").result()
         assert live.monitors[FEEDER].commissioning.progress().state is Stage.LEARNING
+
+
+@pytest.fixture
+def left(served: tuple[str, Told], tmp_path: Path) -> str:
+    """A copy of the database of the service that has ended."""
+    folder = Path(served[0].removeprefix("sqlite:///")).parent
+    return f"sqlite:///{shutil.copytree(folder, tmp_path / 'copy')}/s.db"
+
+
+def test_a_meter_that_has_become_honest_is_cleared_after_a_restart(site: Site, left: str) -> None:
+    """From the restart on all readings are true: 60 of them clear all meters, and the first five none."""
+    honest = Scenario(seed=6, start=START, duration_s=END_S + 80.0, channel=ROUGH)
+    later = [one for one in by_arrival(simulate(site, honest)) if one.t >= START + END_S]
+    with Store(left) as store:
+        live, told = watching(store, site)
+        feed(live, samples(later, END_S, END_S + 80.0))
+        assert told.suspects(0) == LIARS
+        assert set(told.verdicts[:5]) == {"attacked"}
+        assert told.verdicts[-1] == "clean"
+        assert told.suspects(-1) == ()
+        assert not [alarm for alarm in store.active(FEEDER) if alarm.active]
+        kept = store.distrust(FEEDER)
+        assert kept is not None
+        assert json.loads(kept.text)["meters"] == []
+
+
+def test_a_clock_that_is_set_back_clears_no_meter(
+    site: Site, readings: list[SimulatedReading], left: str
+) -> None:
+    with Store(left) as store:
+        live, told = watching(store, site)
+        feed(live, samples(readings, END_S, END_S + 6.0))
+        monitor = live.monitors[FEEDER]
+        assert monitor.latest is not None
+        monitor.latest = replace(monitor.latest, tick=replace(monitor.latest.tick, t=START + 1e6))
+        feed(live, samples(readings, END_S + 6.0, END_S + 20.0))
+        assert {told.suspects(k) for k in range(len(told.estimates))} == {LIARS}
+
+
+@pytest.mark.parametrize("ticks", [0, 3])
+def test_a_replaced_meter_is_trusted_after_a_restart(
+    site: Site, readings: list[SimulatedReading], left: str, ticks: int
+) -> None:
+    """A second restart after the replacement: the new meter has no part of the suspicion."""
+    with Store(left) as store:
+        live, _ = watching(store, site)
+        feed(live, samples(readings, END_S, END_S + ticks))
+        live.recommission(FEEDER, [LIARS[1]], "Ada", "new meter").result()
+    with Store(left) as store:
+        live, told = watching(store, site)
+        feed(live, samples(readings, END_S + ticks, END_S + ticks + 4))
+        assert told.suspects(0) == (LIARS[0], LIARS[2])
+
+
+def test_the_record_of_another_estimator_begins_learning_anew(
+    site: Site, readings: list[SimulatedReading], left: str
+) -> None:
+    """Learned errors of `modal` are not those of `sequential`; named meters stay suspects."""
+    with Store(left) as store:
+        live, told = watching(store, choose(site, estimator=SEQUENTIAL))
+        feed(live, samples(readings, END_S, END_S + 4.0))
+        progress = live.monitors[FEEDER].commissioning.progress()
+        assert (progress.state, progress.restored) == (Stage.LEARNING, False)
+        assert "estimator" in progress.note
+        assert told.suspects(0) == LIARS

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import Site, from_tables, load
+from feeders.registry import SEQUENTIAL, choose
 from feeders.simulation.plant import MeterErrors
 from feeders.simulation.scenario import Scenario, SimulatedReading, by_arrival, simulate
 from gridsec.attack import Scaling
@@ -34,7 +35,8 @@ END = 40.0
 
 @pytest.fixture(scope="module")
 def site() -> Site:
-    return load(FEEDER)
+    """The feeder watched by `sequential`: time scales of suspects are its own. `modal`: test_modal.py."""
+    return choose(load(FEEDER), estimator=SEQUENTIAL)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from benchmarks.slow_kinds import Days, Seen, lied, played, read_every, watch
 from feeders.model.site import Site, load
-from feeders.registry import DesignedEstimator, design
+from feeders.registry import SEQUENTIAL, DesignedEstimator, choose, design
 from gridsec.arrays import Floats
 from gridsec.estimators.sequential import attack_kind
 from gridsec.interface import ManipulationKind
@@ -215,7 +215,7 @@ def test_a_level_beyond_the_room_is_left_as_far_as_an_honest_meter_leaves_it(
 @pytest.fixture(scope="module")
 def quarters() -> tuple[Site, DesignedEstimator, Days]:
     """Three days of a street that is read every quarter of an hour."""
-    site = read_every(load("cigre-lv"), 900.0)
+    site = read_every(choose(load("cigre-lv"), estimator=SEQUENTIAL), 900.0)
     return site, design(site), played(site, 4, 3.0)
 
 

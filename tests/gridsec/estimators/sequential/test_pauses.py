@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import load
-from feeders.registry import design
+from feeders.registry import SEQUENTIAL, choose, design
 from feeders.simulation.trial import Trial, TrialMeterErrors, frames
 from gridsec.estimators import sequential
 from gridsec.interface import Decision, Frame
@@ -54,7 +54,7 @@ def test_nothing_is_remembered_of_frames_without_readings() -> None:
 def test_the_standard_deviation_covers_the_jitter_of_the_busbar(name: str) -> None:
     """White meters, AC power flow: errors are as large as is said, also those all customers share."""
     trial = Trial(load(name), seed=5, duration_s=150.0, meters=TrialMeterErrors.WHITE)
-    watcher, ratios = design(trial.stated), []
+    watcher, ratios = design(choose(trial.stated, estimator=SEQUENTIAL)), []
     state = watcher.init(0.0)
     for k, (frame, truth) in enumerate(frames(trial)):
         state, estimate, _ = watcher.step(state, frame)

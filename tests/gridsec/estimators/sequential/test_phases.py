@@ -9,7 +9,7 @@ import pytest
 
 from feeders.model.equipment import find
 from feeders.model.site import Site, from_tables, load, load_doubt, one_phase_each
-from feeders.registry import design as design_site
+from feeders.registry import SEQUENTIAL, DesignedEstimator, choose, design
 from feeders.simulation.powerflow import power_flow
 from feeders.simulation.trial import AttackKind, AttackSpec, LoadError, Trial, TrialMeterErrors, frames
 from gridsec.estimators import sequential
@@ -26,6 +26,11 @@ from tests.gridsec.around import MeshedStreet
 from tests.gridsec.street import BASE_KVA, Street, make_plant
 
 CUSTOMERS = 9
+
+
+def watching(site: Site) -> DesignedEstimator:
+    """The sequential monitor of a feeder."""
+    return design(choose(site, estimator=SEQUENTIAL))
 
 
 def apart(one: Plant) -> Plant:
@@ -195,7 +200,7 @@ def test_balanced_phases_are_the_single_phase_equivalent() -> None:
         found = three.feeder.bus_voltages(*thirds, 1.02, steps=steps)[three.feeder.bus]
         np.testing.assert_allclose(found, np.repeat(expected, 3), rtol=0, atol=tolerance)
     # Errors of the loads as well: the mean over a customer's phases is as uncertain as its balanced voltage.
-    made = [design_site(site).design for site in (one, three)]
+    made = [watching(site).design for site in (one, three)]
     priors = [voltage_prior(d.plant.feeder, d.prior.meters, d.doubt, busbar=0.0).between for d in made]
     np.testing.assert_allclose(mean @ priors[1] @ mean.T, priors[0], rtol=0, atol=1e-15)
     assert made[1].customers == 3 * made[0].customers
@@ -237,7 +242,7 @@ class TestTheEuropeanFeeder:
     @pytest.mark.acceptance
     def test_eighteen_liars_are_named_and_nobody_else(self) -> None:
         this = self.trial(AttackSpec(AttackKind.BIAS, 18, 3.0, onset_s=20.0))
-        watcher = design_site(this.stated)
+        watcher = watching(this.stated)
         state, inside = watcher.init(0.0), []
         for frame, truth in frames(this):
             state, estimate, verdict = watcher.step(state, frame)
@@ -250,7 +255,7 @@ class TestTheEuropeanFeeder:
     @pytest.mark.acceptance
     def test_without_a_phase_of_the_busbar_that_phase_is_known_less_well(self) -> None:
         this = self.trial(None, 20.0)
-        watcher = design_site(this.stated)
+        watcher = watching(this.stated)
         phase = np.array(["abc".index(row.phases) for row in this.stated.tables.customers])
         stds, played = [], list(frames(this))
         for lost in (None, 1):
@@ -273,7 +278,7 @@ class TestTheEuropeanFeeder:
 
     def test_one_voltage_for_three_phases_accuses_nobody(self) -> None:
         this = self.trial(None, 20.0)
-        watcher = design_site(this.stated)
+        watcher = watching(this.stated)
         state = watcher.init(0.0)
         for frame, _ in frames(this):
             assert frame.v0_phases is not None
@@ -291,7 +296,7 @@ class TestTheEuropeanFeeder:
         self, said: float | None
     ) -> None:
         this = self.trial(None, 20.0)
-        watcher = design_site(this.stated)
+        watcher = watching(this.stated)
         phase = np.array(["abc".index(row.phases) for row in this.stated.tables.customers])
         state = watcher.init(0.0)
         for frame, _ in frames(this):
@@ -304,7 +309,7 @@ class TestTheEuropeanFeeder:
     @pytest.mark.acceptance
     def test_absurd_frames_get_an_answer(self) -> None:
         this = self.trial(None, 32.0)
-        watcher = design_site(this.stated)
+        watcher = watching(this.stated)
         rng, absurd = np.random.default_rng(8), np.array([np.nan, np.inf, -np.inf, -1.0, 0.0, 1e300, 1.0])
         state, answers = watcher.init(0.0), []
         for tick, (frame, _) in enumerate(frames(this)):
@@ -339,7 +344,7 @@ def test_a_busbar_that_moved_while_it_was_silent_accuses_nobody(name: str) -> No
         load_error=LoadError(0.6, 0.2),
         profile_s=300_000.0,
     )
-    watcher = design_site(this.stated)
+    watcher = watching(this.stated)
     state = watcher.init(0.0)
     for tick, (frame, _) in enumerate(frames(this)):
         moved = 0.025 * (tick >= 30)

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from feeders.model.site import load
-from feeders.registry import design
+from feeders.registry import SEQUENTIAL, choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.scenario import START
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, frames
@@ -127,7 +127,7 @@ def test_a_third_lies_about_voltages_and_powers_alike() -> None:
         meters=TrialMeterErrors.REAL,
         lie=lie,
     )
-    watcher = design(trial.stated)
+    watcher = design(choose(trial.stated, estimator=SEQUENTIAL))
     state, rng = watcher.init(START), np.random.default_rng(5)
     fake = rng.uniform(-15.0, 15.0, site.meters.size) / site.feeder.base_kva
     for frame, truth in frames(trial):

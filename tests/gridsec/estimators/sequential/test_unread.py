@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import load, to_frame
-from feeders.registry import design
+from feeders.registry import SEQUENTIAL, choose, design
 from feeders.simulation.scenario import Scenario, simulate, snapshots
 from gridsec.attack import Attack, Replay, Stuck
 from gridsec.estimators.sequential import SuspicionRecord, distrusted, init, warm_start
@@ -107,7 +107,7 @@ def test_who_repeats_himself_is_not_believed_until_that_would_be_noticed_anew(
     attack: Attack, restart: int, ticks: int
 ) -> None:
     """A monitor that begins anew remembers no reading: honest values of once look honest to it at first."""
-    site = load("simbench-lv-rural1")
+    site = choose(load("simbench-lv-rural1"), estimator=SEQUENTIAL)
     made, played = design(site), Scenario(seed=1, start=1_000.0, duration_s=float(ticks), attacks=(attack,))
     state, suspected = made.init(1_000.0), []
     for k, seen in enumerate(snapshots(simulate(site, played))):
@@ -123,7 +123,7 @@ def test_who_repeats_himself_is_not_believed_until_that_would_be_noticed_anew(
 
 
 def test_who_repeated_himself_and_is_mended_is_believed_again() -> None:
-    site = load("simbench-lv-rural1")
+    site = choose(load("simbench-lv-rural1"), estimator=SEQUENTIAL)
     made, line = design(site), []
     before = SuspicionRecord.empty(len(site.meter_ids), site.droop.tau.size)
     which = np.isin(np.arange(len(site.meter_ids)), WHO)
