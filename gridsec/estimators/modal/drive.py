@@ -105,13 +105,8 @@ def driven(  # noqa: PLR0917  # the state, and one frame
     return given, measured, predict(front, given, measured, uncertainty.sizes)
 
 
-def followed(  # noqa: PLR0917  # the state, and one frame
-    front: SequentialDesign,
-    before: InjectionError,
-    given: SequentialState,
-    measured: Measurements,
-    now: Prediction,
-    h: float,
+def followed(
+    front: SequentialDesign, before: InjectionError, given: SequentialState, now: Prediction, h: float
 ) -> InjectionError:
     """Errors of the injections after a tick, as deviations times ``sqrt(3)``.
 
@@ -119,24 +114,22 @@ def followed(  # noqa: PLR0917  # the state, and one frame
     ----------
     front, before
         The front end, and the errors before.
-    given
-        Its state before the tick, with the trust of the tick.
-    measured, now
-        The measurements of the frame, and the frame by the model.
+    given, now
+        Its state before the tick with the trust of the tick, and the frame by the model.
     h
         Interval, s.
     """
     own, meter, at = now.injection_error, front.meter_of, front.plant.droop.customer
     if not meter.size or given.last is None:
         return own
-    trusted, free, width = given.trust.trusted[meter], estimated(front, given.trust.trusted), own.width
+    free, width = estimated(front, given.trust.trusted), own.width
     if any_of(free):
         width = np.where(free, sqrt(3.0) * given.last[0].std[at], width)
     target = injection_target(front, before, own.input, width)
     errors = relaxed(front, before, own.input, width, target, h)
-    # A metered power that no curve allows is not used, and then the injection is unknown.
-    read = (meter >= 0) & trusted & measured.available[meter]
-    return errors.reset((measured.reports_q & ~measured.uses_q)[at] & read)
+    checks = given.inverter_checks
+    # The voltages have decided that this inverter leaves its curve: its injection says nothing about others.
+    return errors if checks.idle else errors.reset(checks.named(front))
 
 
 def estimated(front: SequentialDesign, trusted: Bools) -> Bools:

@@ -273,7 +273,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
         front, design.core, state.core, given, measured, uncertainty, state.injections, own
     )
     h = frame.t - given.t
-    injections = drive.followed(front, state.injections, given, measured, predicted, h)
+    injections = drive.followed(front, state.injections, given, predicted, h)
     jumps = trusted & ~given.trust.trusted
     held = state.held
     if any_of(jumps) or any_of(held):
