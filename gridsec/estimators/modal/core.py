@@ -234,12 +234,12 @@ def assemble(
 
 
 def design(front: SequentialDesign, most: Floats | None = None) -> Core:
-    """Core of a feeder that the default monitor watches.
+    """Core of a feeder with a front end.
 
     Parameters
     ----------
     front
-        Design of the default monitor, with its rate of false alarms.
+        Design of the front end, with the rate of false alarms.
     most : (N,)
         Largest active powers that the customers can have, pu; None: `CONNECTION` for each.
     """
@@ -267,7 +267,7 @@ def residuals(state: SequentialState) -> tuple[Floats, Bools]:
     Parameters
     ----------
     state
-        State of the default monitor after a tick.
+        State of the front end after a tick.
     """
     window = state.window
     seen = window.available[-1]

@@ -177,7 +177,7 @@ class ResidualModel:
 
 
 def residual_model(design: SequentialDesign) -> ResidualModel:
-    """Model of the residuals of the default monitor's front end.
+    """Model of the residuals of the front end.
 
     Parameters
     ----------

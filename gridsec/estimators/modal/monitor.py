@@ -861,11 +861,11 @@ def warm_start(design: ModalDesign, state: ModalState, before: SuspicionRecord) 
 
 
 def observed(design: ModalDesign, state: ModalState) -> ObserverRecord | None:
-    """Observer of a state, as of the default estimator."""
+    """Observer of a state, that of the front end."""
     return front_state.observed(design.front, state.front)
 
 
 def resume(design: ModalDesign, state: ModalState, before: ObserverRecord) -> ModalState:
-    """State from `init` with the observer of an earlier run, as of the default estimator."""
+    """State from `init` with the observer of an earlier run, that of the front end."""
     front = front_state.resume(design.front, state.front, before)
     return state if front is state.front else replace(state, front=front)
