@@ -516,7 +516,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         inverters=inverters,
         inverter_attack=_injected(design, state, checks, inverters),
         kinds=kinds.kinds,
-        explanations=rivals if suspected and len(rivals) > 1 else open_cases,
+        explanations=verdict.combined(rivals, open_cases, inverters) if suspected else open_cases,
         unjudged=front.inverter_undetectable & ~(checks.observable | inverters),
         busbar=given.busbar,
         busbar_attack=given.busbar_off,

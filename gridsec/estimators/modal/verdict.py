@@ -273,6 +273,35 @@ def explanations(
     return tuple(out)
 
 
+def combined(
+    rivals: tuple[Explanation, ...], cases: tuple[Explanation, ...], inverters: Bools
+) -> tuple[Explanation, ...]:
+    """Explanations of the voltages and of metered reactive powers together, the likeliest first.
+
+    Both are independent: probabilities multiply, and equal sets are one.
+
+    Parameters
+    ----------
+    rivals, cases
+        Explanations by the search, and open cases of metered reactive powers.
+    inverters : (m,)
+        Inverters that are named in any case.
+    """
+    sure = np.zeros_like(inverters)
+    if cases or any_of(inverters):
+        together: dict[bytes, Explanation] = {}
+        for one in rivals:
+            for case in cases or (Explanation(one.meters, sure, 1.0, one.powers),):
+                meters, powers = one.meters | case.meters, one.powers | case.powers
+                also = one.inverters | case.inverters | inverters
+                key = meters.tobytes() + powers.tobytes() + also.tobytes() + one.busbar.tobytes()
+                share = one.probability * case.probability
+                share += together[key].probability if key in together else 0.0
+                together[key] = replace(one, meters=meters, powers=powers, inverters=also, probability=share)
+        rivals = tuple(sorted(together.values(), key=lambda each: -each.probability))
+    return rivals if len(rivals) > 1 else cases
+
+
 def certain_inverters(design: SequentialDesign, core: Core, suspicion: Suspicion, uses_q: Bools) -> Bools:
     """Inverters without which nothing explains the readings, (m,).
 

@@ -11,7 +11,8 @@ from gridsec.arrays import Bools
 from gridsec.estimators.modal.monitor import CONFIRM, confirmed, design, init, own_errors, step
 from gridsec.estimators.modal.replay import Reading
 from gridsec.estimators.modal.search import Identification
-from gridsec.interface import Decision
+from gridsec.estimators.modal.verdict import combined
+from gridsec.interface import Decision, Explanation
 from tests.gridsec.estimators.sequential.test_monitor import prepare
 from tests.gridsec.street import Street, make_plant
 
@@ -91,3 +92,22 @@ def test_errors_of_registers_follow_the_voltage() -> None:
     off = own_errors(made, state.core) - 2.0 * street.bias
     # All meters share the error of the busbar's.
     assert np.abs(off - off.mean()).max() < 5e-4
+
+
+def test_explanations_of_voltages_and_of_reported_powers_multiply() -> None:
+    """Equal sets are one, and inverters named in any case are in each."""
+
+    def way(meter: int, inverter: int, power: int, probability: float) -> Explanation:
+        return Explanation(mask(meter), mask(inverter, size=3), probability, mask(power), mask(size=1))
+
+    rivals = (way(1, -1, -1, 0.6), way(-1, 0, -1, 0.4))
+    cases = (way(-1, 0, -1, 0.7), way(-1, -1, 2, 0.3))
+    told = combined(rivals, cases, mask(1, size=3))
+    assert [round(each.probability, 6) for each in told] == [0.42, 0.28, 0.18, 0.12]
+    assert all(each.inverters[1] for each in told)
+    assert told[0].meters[1]
+    assert told[3].powers[2]
+    assert told[3].inverters[0]
+    twice = combined((way(1, -1, -1, 0.6), way(1, 0, -1, 0.4)), (way(-1, 0, -1, 1.0),), mask(0, size=3))
+    assert [each.probability for each in twice] == [1.0]
+    assert combined(rivals, (), mask(size=3)) is rivals
