@@ -152,7 +152,7 @@ def test_an_inverter_off_its_curve_is_never_clean_and_nobody_else_is_accused(
             accused = set(site.droop.customer[way.inverters].tolist()) | set(
                 np.flatnonzero(way.powers).tolist()
             )
-            # `modal` also states false powers elsewhere, at one percent each: the voltages do not exclude them.
+            # `modal` also states false powers elsewhere that the voltages do not exclude, at 1 % each.
             assert accused == {owner} or (estimator == MODAL and k and owner in accused)
     assert since > 20
 
