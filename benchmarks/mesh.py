@@ -22,7 +22,7 @@ from feeders.model.site import Site, from_tables, load
 from feeders.registry import SEQUENTIAL, choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.powerflow import power_flow
-from feeders.simulation.trial import LoadError, Trial, judge
+from feeders.simulation.trial import LoadError, Trial, TrialResult, judge
 from gridsec.arrays import Floats
 from gridsec.grid.meshed import Meshed
 
@@ -123,6 +123,11 @@ def sensitivity(site: Site, part: float) -> str:
     return f"| {feeder.name} | {part:g} | " + " | ".join(f"{100 * v:.2g} %" for v in np.ravel(cells, "F"))
 
 
+def judged(trial: Trial) -> TrialResult:
+    """Verdicts of `sequential` on one trial."""
+    return judge(design(choose(trial.stated, estimator=SEQUENTIAL)), trial, settling_s=3.0)
+
+
 def named(site: Site, trick: AttackKind, percent: float) -> str:
     """One row: liars, those missed, the slowest, honest meters named, time of a step."""
     kw, count = LOAD_KW[site.feeder.name], LIARS.get(site.feeder.name, site.meters.size // 3)
@@ -130,7 +135,7 @@ def named(site: Site, trick: AttackKind, percent: float) -> str:
     for seed in SEEDS:
         lie = AttackSpec(trick, count, percent, onset_s=10.0)
         trial = Trial(site, seed, 30.0, load_error=LoadError(kw, kw / 3.0), lie=lie)
-        outcomes.append(judge(design(choose(trial.stated, estimator=SEQUENTIAL)), trial, settling_s=3.0))
+        outcomes.append(judged(trial))
     missed, accused = sum(o.missed for o in outcomes), sum(int(o.accused.sum()) for o in outcomes)
     slowest = max(float(o.delay_s.max()) for o in outcomes)
     step = np.median(np.concatenate([o.step_ms for o in outcomes]))
@@ -145,9 +150,7 @@ def clean(site: Site) -> str:
     """One row without manipulation: honest meters named, and the seconds without an answer."""
     kw = LOAD_KW[site.feeder.name]
     trials = [Trial(site, seed, 30.0, load_error=LoadError(kw, kw / 3.0)) for seed in SEEDS]
-    outcomes = [
-        judge(design(choose(trial.stated, estimator=SEQUENTIAL)), trial, settling_s=3.0) for trial in trials
-    ]
+    outcomes = [judged(trial) for trial in trials]
     accused = sum(int(o.accused.sum()) for o in outcomes)
     undecided = sum(int(o.undecided[15:].sum()) for o in outcomes)
     return f"| {site.feeder.name} | nobody | | | | {accused} | {undecided} undecided |"

@@ -232,6 +232,7 @@ def campaign(
     """Simulate attacks over days of profiles: meters named correctly, missed or named falsely, and delays."""
     from feeders.model.site import load
     from feeders.profiles import Season
+    from feeders.registry import SEQUENTIAL
     from feeders.simulation.trial import TrialMeterErrors
     from feeders.studies.campaign.plan import Design, Place
     from feeders.studies.campaign.study import campaign as study
@@ -265,7 +266,8 @@ def campaign(
                 places=places,
                 design=drawn,
                 seasons=seasons,
-                estimator=estimator or (PROMISING if promised else None),
+                # A more sensitive estimator names attacks of the sizes that `study detectable` calls hidden.
+                estimator=estimator or (SEQUENTIAL if promised else None),
                 alarms_per_year=tuple(sorted(set(alarms_per_year))) if alarms_per_year else None,
                 learn_s=3600.0 * learned,
                 settings=tuple(settings),
@@ -291,9 +293,6 @@ def campaign(
         write_tables(out, "campaign", found.tables)
         output.end(site, found, plot)
 
-
-PROMISING = "sequential"
-"""Estimator of the guarantees of `study detectable`; a more sensitive one names attacks of hidden sizes."""
 
 NO_LIES = (
     "one scenario of each scene is the control scenario without an attack; expected --scenarios and "

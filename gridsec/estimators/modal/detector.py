@@ -50,7 +50,7 @@ from gridsec.estimators.modal import signatures
 from gridsec.estimators.modal.filter import Update
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.signatures import Columns, Onsets, Scores
-from gridsec.estimators.modal.static import Static
+from gridsec.estimators.modal.static import Static, squares
 
 SIZE = 0.01
 """Prior standard deviation of a fault, squared pu: 0.5 % of the voltage, the class of ordinary meters."""
@@ -262,15 +262,15 @@ def step(
 def _stands_out(modes: Modes, update: Update, static: Static, least: Precision) -> bool:
     """A member, a phase of the busbar, or all together, stand out in one innovation of all members."""
     v, exact = update.variance, update.exact
+    if squares(static, update) > v.size + sqrt(2.0 * JUMP * v.size):
+        return True
     if exact is not None:
-        sigma, misfit = exact.score, float(exact.white @ exact.white)
+        sigma = exact.score
         felt, _ = lapack.dtrtrs(exact.half, modes.phases, lower=True)
         of_busbar = (felt * felt).sum(axis=0)
     else:
-        sigma, misfit = modes.U @ static.score, float(static.score @ (v * static.score))
+        sigma = modes.U @ static.score
         of_busbar = modes.phase_squares @ (1.0 / v)
-    if misfit > v.size + sqrt(2.0 * JUMP * v.size):
-        return True
     y = sigma @ modes.phases
     if any_of(y * y > JUMP * of_busbar):
         return True

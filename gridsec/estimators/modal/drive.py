@@ -2,7 +2,6 @@
 
     driven(...) -> (SequentialState, Measurements, Prediction)  no inverter follows a reading that jumps
     followed(...) -> InjectionError                             every tick
-    accused(...) -> InjectionError                              where a meter loses its trust
 
 A manipulated reading that drives an inverter of the model moves the residuals of all others. An inverter
 with a distrusted meter follows the last estimate, moved by the model. The error of its input has the
@@ -91,7 +90,7 @@ def driven(  # noqa: PLR0917  # the state, and one frame
     if not any_of(drives & far):
         return given, measured, predicted
     off, std = verdict.deviations(core, state, m)
-    free = estimated(front, given.trust.trusted)
+    free = front.inverters_of(~given.trust.trusted)
     open_ = doubts.unknown(front, measured, uncertainty, before.error, free, given.clock_skew)
     if open_ is not None:
         std = np.sqrt(std**2 + (open_.wide**2).sum(axis=1))
@@ -105,8 +104,13 @@ def driven(  # noqa: PLR0917  # the state, and one frame
     return given, measured, predict(front, given, measured, uncertainty.sizes)
 
 
-def followed(
-    front: SequentialDesign, before: InjectionError, given: SequentialState, now: Prediction, h: float
+def followed(  # noqa: PLR0917  # the state, and one frame
+    front: SequentialDesign,
+    before: InjectionError,
+    given: SequentialState,
+    now: Prediction,
+    free: Bools,
+    h: float,
 ) -> InjectionError:
     """Errors of the injections after a tick, as deviations times ``sqrt(3)``.
 
@@ -115,44 +119,19 @@ def followed(
     front, before
         The front end, and the errors before.
     given, now
-        Its state before the tick with the trust of the tick, and the frame by the model.
+        Its state before the tick, and the frame by the model.
+    free : (m,)
+        Inverters with a distrusted meter at this tick.
     h
         Interval, s.
     """
-    own, meter, at = now.injection_error, front.meter_of, front.plant.droop.customer
-    if not meter.size or given.last is None:
+    own, width = now.injection_error, now.injection_error.width
+    if not front.meter_of.size or given.last is None:
         return own
-    free, width = estimated(front, given.trust.trusted), own.width
     if any_of(free):
-        width = np.where(free, sqrt(3.0) * given.last[0].std[at], width)
+        width = np.where(free, sqrt(3.0) * given.last[0].std[front.plant.droop.customer], width)
     target = injection_target(front, before, own.input, width)
     errors = relaxed(front, before, own.input, width, target, h)
     checks = given.inverter_checks
     # The voltages have decided that this inverter leaves its curve: its injection says nothing about others.
     return errors if checks.idle else errors.reset(checks.named(front))
-
-
-def estimated(front: SequentialDesign, trusted: Bools) -> Bools:
-    """Inverters that follow the estimate, (m,).
-
-    Parameters
-    ----------
-    front
-        The front end.
-    trusted : (p,)
-        Trusted meters.
-    """
-    return np.asarray((front.meter_of >= 0) & ~trusted[front.meter_of])
-
-
-def accused(front: SequentialDesign, errors: InjectionError, which: Bools) -> InjectionError:
-    """Errors of the injections where meters `which` (p,) lose their trust: a false reading drove them.
-
-    Parameters
-    ----------
-    front, errors
-        The front end, and the errors of the tick.
-    which : (p,)
-        Meters accused at this tick.
-    """
-    return errors.reset((front.meter_of >= 0) & which[front.meter_of]) if any_of(which) else errors

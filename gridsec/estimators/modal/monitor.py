@@ -272,8 +272,8 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     given, measured, predicted = drive.driven(
         front, design.core, state.core, given, measured, uncertainty, state.injections, own
     )
-    h = frame.t - given.t
-    injections = drive.followed(front, state.injections, given, predicted, h)
+    h, free = frame.t - given.t, front.inverters_of(~given.trust.trusted)
+    injections = drive.followed(front, state.injections, given, predicted, free, h)
     jumps = trusted & ~given.trust.trusted
     held = state.held
     if any_of(jumps) or any_of(held):
@@ -292,7 +292,6 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
         attack_kinds=kinds,
         v0_squared=measured.v0_squared,
     )
-    free = drive.estimated(front, given.trust.trusted)
     open_ = doubts.unknown(front, measured, uncertainty, injections.error, free, skew)
     jump, movements = doubts.jump(front, design.reach, state.movements, measured, h)
     seen, whole, m = measured.available, all_of(measured.available), measured.y - drive.expected(v2, own)
@@ -526,7 +525,8 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         record.kept(design.core.modes, state.kept, kernel.filter, kernel.static, now.ticks) if calm else None
     )
     learning = _gathered(design, trust, tick, suspected=doubtful)
-    new = now.trust.trusted & ~trust.trust.trusted
+    # A false reading has driven the inverters of meters that lose their trust.
+    fed = front.inverters_of(now.trust.trusted & ~trust.trust.trusted)
     after = changed(
         trust,
         t=tick.measured.frame.t,
@@ -535,15 +535,16 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         x=tick.predicted.x,
         transient=tick.predicted.transient,
         model_driven=tick.predicted.model_driven,
-        injection_error=drive.accused(front, tick.predicted.injection_error, new),
+        injection_error=tick.predicted.injection_error.reset(fed),
         inverter_checks=checks,
         attack_kinds=kinds,
         busbar=busbar,
         learning=learning,
         last=(estimate, answer),
     )
-    injections = drive.accused(front, tick.injections, new)
-    out = changed(state, front=after, kept=kept or state.kept, held=tick.held, injections=injections)
+    out = changed(
+        state, front=after, kept=kept or state.kept, held=tick.held, injections=tick.injections.reset(fed)
+    )
     return (out if learning is None else _learned(design, out)), estimate, answer
 
 

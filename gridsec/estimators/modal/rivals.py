@@ -40,7 +40,7 @@ from gridsec.estimators.modal.filter import FilterState, Interval, Update
 from gridsec.estimators.modal.model import REPORTED_S, Modes
 from gridsec.estimators.modal.replay import History, Suspected
 from gridsec.estimators.modal.signatures import Joint, Onsets
-from gridsec.estimators.modal.static import Static
+from gridsec.estimators.modal.static import Static, squares
 
 UNREST = (1.0, 30.0)
 """Variances of the loads' changes of the rivals, in those of the model, 1."""
@@ -216,15 +216,15 @@ def follow(  # noqa: PLR0917  # the state, and one tick
         total, jumps = total + prior, jumps + (size > 0.0)
         state = _jumped(modes, state, gap, size)
     state, known, update = exact.step(modes, state, known, t, m, seen, stay=True, unknown=unknown, jump=jump)
+    square = squares(known, update)
     if update.exact is None:
-        squares, count = float(known.score @ (update.variance * known.score)), modes.size
+        count = modes.size
         total -= 0.5 * float((update.innovation**2 / update.variance + np.log(update.variance)).sum())
         if begun or onsets.used[0]:
             onsets = signatures.follow(modes, onsets, update, known, gap.h, begun=[0] if begun else [])
     else:
-        half, white = update.exact.half, update.exact.white
-        squares, count = float(white @ white), white.size
-        total -= 0.5 * squares + float(np.log(half.diagonal()).sum())
+        count = update.exact.white.size
+        total -= 0.5 * square + float(np.log(update.exact.half.diagonal()).sum())
         if begun:
             suspected = replay.begun(modes, 0, bool(onsets.ramp[0]))
         if suspected is not None:
@@ -239,7 +239,7 @@ def follow(  # noqa: PLR0917  # the state, and one tick
         suspected=suspected,
         jumps=jumps,
         unsteady=before.unsteady + (float(size > 0.0) - before.unsteady) / RECENT,
-        misfit=squares - count + (0.0 if begun else before.misfit),
+        misfit=square - count + (0.0 if begun else before.misfit),
         update=update,
         loads=loads,
     )

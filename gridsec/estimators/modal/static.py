@@ -127,6 +127,19 @@ def follow(modes: Modes, before: Static, update: Update) -> Static:
     return Static(g, gamma, pull, information, theta, cov, score, constant)
 
 
+def squares(now: Static, update: Update) -> float:
+    """Squares of the whitened innovation of a tick: their number is expected without a fault.
+
+    Parameters
+    ----------
+    now, update
+        The information with this tick, and the filter's step.
+    """
+    if update.exact is not None:
+        return float(update.exact.white @ update.exact.white)
+    return float(now.score @ (update.variance * now.score))
+
+
 def _learned(modes: Modes, before: Static, information: Floats, pull: Floats) -> tuple[Floats, Floats]:
     """Theta of this tick, (r,), and N of this tick or an earlier one, (r, r)."""
     if modes.sign.size > FEW:

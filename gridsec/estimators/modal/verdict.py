@@ -287,11 +287,11 @@ def combined(
     inverters : (m,)
         Inverters that are named in any case.
     """
-    sure = np.zeros_like(inverters)
+    none = np.zeros_like(inverters)
     if cases or any_of(inverters):
         together: dict[bytes, Explanation] = {}
         for one in rivals:
-            for case in cases or (Explanation(one.meters, sure, 1.0, one.powers),):
+            for case in cases or (Explanation(one.meters, none, 1.0, one.powers),):
                 meters, powers = one.meters | case.meters, one.powers | case.powers
                 also = one.inverters | case.inverters | inverters
                 key = meters.tobytes() + powers.tobytes() + also.tobytes() + one.busbar.tobytes()

@@ -192,6 +192,10 @@ class SequentialDesign:
         """One observer for every trusted set."""
         return 1
 
+    def inverters_of(self, meters: Bools) -> Bools:
+        """Inverters with a meter that is one of `meters` (p,), (m,)."""
+        return np.asarray((self.meter_of >= 0) & meters[self.meter_of])
+
 
 def design(
     plant: Plant,

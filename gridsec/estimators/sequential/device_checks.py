@@ -205,7 +205,7 @@ class InverterChecks:
 
     def named(self, design: SequentialDesign) -> Bools:
         """Inverters that do not follow their curves, (m,)."""
-        return (design.meter_of >= 0) & self.sure[design.meter_of] if self.sure.size else self.observable
+        return design.inverters_of(self.sure) if self.sure.size else self.observable
 
     def amounts(self, design: SequentialDesign) -> Floats:
         """Deviation of each inverter from its curve, (m,), pu."""
@@ -331,8 +331,7 @@ def check_inverters(design: SequentialDesign, before: InverterChecks, now: Repor
     sure = lasts & beyond & ((share >= 1.0 - 1.0 / design.options.like) | (before.sure & (share >= 0.5)))
     least, most = (of[at] for of in droop.saturated(size))
     enough = asked & (room < np.maximum(most - x, x - least))
-    observable = (design.meter_of >= 0) & enough[design.meter_of]
-    return InverterChecks(count, lasts, amount, share, sure, observable)
+    return InverterChecks(count, lasts, amount, share, sure, design.inverters_of(enough))
 
 
 def posterior_share(  # noqa: PLR0917  # one posterior, and one report

@@ -259,7 +259,7 @@ def _state(  # noqa: PLR0917
     new = state.trust.trusted & ~trust.trusted
     if any_of(new):
         # A manipulated meter drove these inverters.
-        error = error.reset((design.meter_of >= 0) & new[design.meter_of])
+        error = error.reset(design.inverters_of(new))
         if state.x is not None:
             available = trust.trusted & measured.available
             model_driven = prepare(design, available, frame.t - state.t, model_driven)
@@ -435,7 +435,7 @@ def _inverters(
 ) -> tuple[Floats, ModelDriven | None, InjectionError]:
     """Injections at this frame, the prepared loop, and errors; at rest at the first frame."""
     droop, meter, feeder, frame = design.plant.droop, design.meter_of, design.plant.feeder, measured.frame
-    driven = (meter >= 0) & (state.trust.trusted & measured.available)[meter]
+    driven = design.inverters_of(state.trust.trusted & measured.available)
     y = measured.y[meter] if meter.size else np.zeros(0)
     if not all_of(driven):
         y = np.where(driven, y, feeder.broadcast_busbar(measured.v0_squared)[feeder.bus[droop.customer]])
@@ -499,7 +499,7 @@ def prepare(
 
     Prepared at the tick of a suspicion, since the tick after it has more to compute.
     """
-    driven = (design.meter_of >= 0) & trusted[design.meter_of]
+    driven = design.inverters_of(trusted)
     return before if all_of(driven) else _prepared(design, indices(~driven), h, before)
 
 

@@ -85,6 +85,13 @@ def feed(live: Engine, some: list[Sample]) -> None:
         live.cycle(some[k : k + 50])
 
 
+def report_ahead(live: Engine) -> None:
+    """Date the latest report to 11 days ahead, as before a clock that is set back."""
+    monitor = live.monitors[FEEDER]
+    assert monitor.latest is not None
+    monitor.latest = replace(monitor.latest, tick=replace(monitor.latest.tick, t=START + 1e6))
+
+
 def known(live: Engine) -> Commission:
     found = live.monitors[FEEDER].commissioning.known
     assert found is not None
@@ -321,9 +328,8 @@ def test_a_clock_that_is_set_back_costs_nothing_that_was_learned(
     with Store(f"sqlite:///{tmp_path}/s.db") as store:
         live = rounds(store, site)
         feed(live, samples(honest, 0, 70))
-        before, monitor = known(live), live.monitors[FEEDER]
-        assert monitor.latest is not None
-        monitor.latest = replace(monitor.latest, tick=replace(monitor.latest.tick, t=START + 1e6))
+        before = known(live)
+        report_ahead(live)
         feed(live, samples(honest, 70, 80))
         assert same(known(live), before)
 

@@ -7,6 +7,7 @@ import shutil
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,12 +26,19 @@ from service.ingest.align import Clock
 from service.report.report import to_json
 from service.store import Store, StoreUnavailable
 from service.store.state_codec import MonitorState, StateSnapshot, encode, fingerprint
-from tests.service.engine.test_commissioning import START, feed, samples, variant
+from tests.service.engine.test_commissioning import START, feed, report_ahead, samples, variant
 from tests.service.running import FEEDER, Outlet
 
 LIARS = ("m01", "m03", "m04", "m09")
 END = 40.0
 """When the service ends, s after the beginning; it has named the liars by then."""
+
+
+def stored(store: Store) -> list[dict[str, Any]]:
+    """Suspects in the database."""
+    kept = store.distrust(FEEDER)
+    assert kept is not None
+    return list(json.loads(kept.text)["meters"])
 
 
 @pytest.fixture(scope="module")
@@ -100,10 +108,8 @@ def until_the_end(url: str, site: Site, learned: StateSnapshot, readings: list[S
         live, told = watching(store, site)
         feed(live, samples(readings, 0, END))
         assert told.suspects(-1) == LIARS
-        kept = store.distrust(FEEDER)
-        assert kept is not None
         # On means over many ticks, which are empty after a restart.
-        assert {meter["scale_s"] for meter in json.loads(kept.text)["meters"]} == {15.0}
+        assert {meter["scale_s"] for meter in stored(store)} == {15.0}
 
 
 @pytest.fixture(scope="module")
@@ -162,9 +168,7 @@ def test_who_has_become_honest_meanwhile_is_cleared(
         assert 12 <= first <= 12 + 6 + 2
         assert set(told.verdicts[first:]) == {"clean"}
         assert not [alarm for alarm in store.active(FEEDER) if alarm.active]
-        kept = store.distrust(FEEDER)
-        assert kept is not None
-        assert json.loads(kept.text)["meters"] == []
+        assert stored(store) == []
 
 
 @pytest.mark.parametrize("ticks", [0, 3])
@@ -215,9 +219,7 @@ def test_a_damaged_text_costs_the_suspicions_and_nothing_else(
         assert "damaged" in monitor.suspicions.note
         assert monitor.commissioning.restored
         assert told.suspects(0) == ()
-        kept = store.distrust(FEEDER)
-        assert kept is not None
-        assert json.loads(kept.text)["meters"] == []
+        assert stored(store) == []
 
 
 def test_a_clock_that_is_set_back_clears_nobody(
@@ -226,9 +228,7 @@ def test_a_clock_that_is_set_back_clears_nobody(
     with Store(f"sqlite:///{left}") as store:
         live, told = watching(store, site)
         feed(live, samples(lying, END, END + 6))
-        monitor = live.monitors[FEEDER]
-        assert monitor.latest is not None
-        monitor.latest = replace(monitor.latest, tick=replace(monitor.latest.tick, t=START + 1e6))
+        report_ahead(live)
         feed(live, samples(lying, END + 6, END + 40))
         assert {told.suspects(k) for k in range(len(told.estimates))} == {LIARS}
 
