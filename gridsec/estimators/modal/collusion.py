@@ -27,7 +27,9 @@ has the relaxation
 
     minimise  x^2 g' F g / 2 - x y' g,      0 <= g <= 1,      g = 0 on C
 
-which is convex [1]_. Its solution orders the meters. The best beginning of this order is improved by single
+which is convex [1]_. With any amounts it is a minimum over z >= 0 of all meters outside of C, ``z' F z / 2 -
+z' y``, a bound. Where the bound exceeds the limit of a naming, the meters with the largest z are the only g.
+Elsewhere the relaxation's solution orders the meters. The best beginning of this order is improved by single
 meters and by exchanges. x is first the mean amount of C, then that of the set found. Where that gains nothing
 and the solution has more meters than the promise, x is larger. g is also looked for in place of the rest's
 meters of its own sign, since colluding meters may share one amount.
@@ -53,6 +55,7 @@ from gridsec.arrays import Bools, Floats, Ints, any_of, submatrix
 from gridsec.estimators.modal.costs import (
     SearchProblem,
     Tableau,
+    among,
     informed,
     mean_amounts,
     penalties,
@@ -100,17 +103,18 @@ def weighed(found: Identification, masked: Bools, near: Neighbourhoods) -> Ident
     by_model, least = costs_of(found), -2.0 * log(DOUBT)
     contested = np.zeros(p, dtype=np.bool_)
     # The onset may be older than that of a masked meter, which J then has, too.
-    parts = [(sign, J[:p] & ~masked & (sign * amount[:p] > 0.0), SPLITS) for sign in (1.0, -1.0)]
+    parts = [(sign, J[:p] & ~masked & (sign * amount[:p] > 0.0), SPLITS) for sign in _SIGNS]
     while parts:
         sign, accused, splits = parts.pop()
         if not any_of(accused & named):
             continue
         own, without = _own(problem, J, accused, sign)
-        sets = _instead(problem, J, amount, accused, masked, most)
+        limit = max(least, MISFIT * (without - own))
+        sets = _instead(problem, J, amount, accused, masked, most, (without, own + limit))
         others = _customers(problem, _without(J, accused), accused, masked, most, near.powers)
         each, other = min(chain(sets, others), key=lambda one: one[0])
         more = max(0.0, each - own)
-        if more < max(least, MISFIT * (without - own)):
+        if more < limit:
             contested |= accused & named
             key = other.tobytes()
             # No more than J: few meters are likelier than many.
@@ -129,30 +133,47 @@ def _own(problem: SearchProblem, J: Bools, accused: Bools, sign: float) -> tuple
     rest = _without(J, accused)
     whole, without = _evidence(problem, np.stack([J, rest])).tolist()
     at, y, F = _beside(problem, rest, accused)
-    alike = _OneSign(sign * y, F, float(problem.std[0]) ** 2, np.ones(at.size, dtype=np.bool_)).cost
+    alike = _OneSign(sign * y, F, float(problem.std[0]) ** 2, np.ones((1, at.size), dtype=np.bool_)).cost[0]
     return min(whole, without + alike), without
 
 
 def _instead(  # noqa: PLR0917  # one explanation
-    problem: SearchProblem, J: Bools, amount: Floats, accused: Bools, masked: Bools, most: int
+    problem: SearchProblem,
+    J: Bools,
+    amount: Floats,
+    accused: Bools,
+    masked: Bools,
+    most: int,
+    between: tuple[float, float],
 ) -> Iterator[tuple[float, Bools]]:
-    """L of sets without the meters accused, (p,), and the sets, (q,)."""
-    p, rest = problem.meters, _without(J, accused)
+    """L of sets without the meters accused, (p,), and the sets, (q,).
+
+    between: L of the explanation without the meters accused, and the limit that L of a set is to fall below.
+    """
+    p, rest, (without, limit) = problem.meters, _without(J, accused), between
     size = float(np.abs(amount[:p][accused]).mean())
-    kept = [rest]
-    for sign in (1.0, -1.0):
-        fewer = _without(rest, sign * amount[:p] > 0.0)
-        for each in (rest,) if np.array_equal(fewer, rest) else (rest, fewer):
-            at, y, F = _beside(problem, each, ~(each[:p] | accused))
-            room = most - int(np.count_nonzero(each[:p] | masked))
+    yield without, rest
+    kept = []
+    fewer = [(_without(rest, sign * amount[:p] > 0.0), (sign,)) for sign in _SIGNS]
+    for each, signs in [(rest, _SIGNS), *(one for one in fewer if not np.array_equal(one[0], rest))]:
+        at, y, F = _beside(problem, each, ~(each[:p] | accused))
+        room = most - int(np.count_nonzero(each[:p] | masked))
+        begun = without if each is rest else float(_evidence(problem, each[None])[0])
+        for sign in signs:
             one = _Relaxed(sign * y, F, float(problem.std[0]) ** 2, ~masked[at], room)
-            cost, inside = one.best(size)
+            least, inside = one.bound()
+            if begun + least < limit:
+                least, inside = one.best(size)
             if any_of(inside):
                 both = each.copy()
                 both[at[inside]] = True
-                yield float(_evidence(problem, each[None])[0]) + cost, both
+                yield begun + least, both
                 kept.append(both)
-    yield from zip(_evidence(problem, np.stack(kept)).tolist(), kept, strict=True)
+    if kept:
+        yield from zip(_evidence(problem, np.stack(kept)).tolist(), kept, strict=True)
+
+
+_SIGNS = (1.0, -1.0)
 
 
 def _customers(  # noqa: PLR0917  # one explanation
@@ -206,10 +227,13 @@ def _evidence(problem: SearchProblem, sets: Bools) -> Floats:
 
 def _beside(problem: SearchProblem, own: Bools, meters: Bools) -> tuple[Ints, Floats, Floats]:
     """Some meters (p,) with readings, their scores (k,) and information (k, k), for any amounts of `own`."""
-    at, A = np.flatnonzero(informed(problem) & meters), Tableau(problem).pivot(own).A
-    F = submatrix(A, at, at)
+    at, used = np.flatnonzero(informed(problem) & meters), own.copy()
+    used[at] = True
+    few, place = among(problem, used), np.cumsum(used)[at] - 1
+    A = Tableau(few).pivot(own[used]).A
+    F = submatrix(A, place, place)
     F[np.diag_indices(at.size)] -= problem.std[at] ** -2.0
-    return at, A[at, -1], F
+    return at, A[place, -1], F
 
 
 class _OneSign(OneAmount):
@@ -228,35 +252,39 @@ class _Limited(_OneSign):
         self.counted, self.room = relaxed.counted, relaxed.room
 
     def toggled(self) -> Floats:
-        """Cost after toggling each meter, (k,)."""
+        """Costs after toggling each meter, (n, k)."""
         sign, fit = self.moved()
-        counted = int(np.count_nonzero(self.inside & self.counted)) + sign * self.counted
-        return np.where((self.count + sign > 0) & (counted <= self.room), fit, inf)
+        counted = np.count_nonzero(self.inside & self.counted, axis=1)[:, None] + sign * self.counted
+        return np.where((self.count[:, None] + sign > 0) & (counted <= self.room), fit, inf)
 
     def descend(self) -> Self:
-        """Lower the cost by single meters and by exchanges until none of them helps."""
+        """Lower the costs by single meters and by exchanges until none of them helps."""
         for _ in range(self.y.size):
             super().descend()
-            out, into = np.flatnonzero(self.inside), np.flatnonzero(~self.inside)
-            if not out.size or not into.size:
+            exchanged = [self._exchange(row) for row in range(len(self.inside))]
+            if not any(exchanged):
                 break
-            fit = self._exchanged(out, into)
-            i, j = np.unravel_index(int(fit.argmin()), fit.shape)
-            if not fit[i, j] < self.cost - GAIN:
-                break
-            self.toggle(int(out[i]))
-            self.toggle(int(into[j]))
         return self
 
-    def _exchanged(self, out: Ints, into: Ints) -> Floats:
-        """Cost after exchanging members `out` (n,) for others `into` (l,), (n, l)."""
-        own = self.F.diagonal()
-        a = self.a + np.subtract.outer(-self.y[out], -self.y[into])
-        b = self.b + np.add.outer(own[out] - 2.0 * self.rows[out], own[into] + 2.0 * self.rows[into])
+    def _exchange(self, row: int) -> bool:
+        """Make the best exchange of a member for another, if one helps."""
+        inside = self.inside[row]
+        out, into = np.flatnonzero(inside), np.flatnonzero(~inside)
+        if not out.size or not into.size:
+            return False
+        own, rows = self.own, self.rows[row]
+        a = self.a[row] + np.subtract.outer(-self.y[out], -self.y[into])
+        b = self.b[row] + np.add.outer(own[out] - 2.0 * rows[out], own[into] + 2.0 * rows[into])
         b -= 2.0 * submatrix(self.F, out, into)
-        counted = int(np.count_nonzero(self.inside & self.counted))
+        counted = int(np.count_nonzero(inside & self.counted))
         more = np.subtract.outer(-self.counted[out].astype(np.intp), -self.counted[into].astype(np.intp))
-        return np.where(counted + more <= self.room, self.fit(a, b), inf)
+        fit = np.where(counted + more <= self.room, self.fit(a, b), inf)
+        i, j = np.unravel_index(int(fit.argmin()), fit.shape)
+        if not fit[i, j] < self.cost[row] - GAIN:
+            return False
+        for one in (out[i], into[j]):
+            self.toggle(np.array([row]), np.array([one]))
+        return True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -289,10 +317,11 @@ class _Relaxed:
         start, tried = np.full(best.size, HALF), amount
         for _ in range(ROUNDS):
             share, before, now = self._share(amount, start), least, 0.0
-            for inside in self._rounded(share):
-                end = _Limited(self, inside).descend()
-                if end.cost < least:
-                    least, best, now = end.cost, end.inside, end.a / (end.b + 1.0 / self.s2)
+            end = _Limited(self, self._rounded(share)).descend()
+            one = int(end.cost.argmin())
+            if end.cost[one] < least:
+                least, best = float(end.cost[one]), end.inside[one]
+                now = float(end.a[one] / (end.b[one] + 1.0 / self.s2))
             if not (least < before - WORTH and now > 0.0):
                 if share @ self.counted <= self.room:
                     break
@@ -302,29 +331,44 @@ class _Relaxed:
             tried = max(tried, now)
         return least, best
 
-    def _rounded(self, share: Floats) -> Iterator[Bools]:
-        """Beginnings of the order by the shares: the best one, the larger half, and the longest."""
+    def _rounded(self, share: Floats) -> Bools:
+        """Beginnings of the order by the shares: the best one, the larger half, and the longest, (n, k)."""
         order = np.argsort(-share, kind="stable")
         order = order[np.cumsum(self.counted[order]) <= self.room]
         F = submatrix(self.F, order, order)
-        one = _OneSign(self.y, self.F, self.s2, np.zeros(share.size, dtype=np.bool_))
+        one = _OneSign(self.y, self.F, self.s2, np.zeros((1, share.size), dtype=np.bool_))
         nested = one.fit(np.cumsum(self.y[order]), np.cumsum(np.cumsum(F, 0), 1).diagonal())
         half = max(1, int((share[order] > HALF).sum()))
-        for k in {int(nested.argmin()) + 1, half, order.size}:
-            inside = np.zeros(share.size, dtype=np.bool_)
-            inside[order[:k]] = True
-            yield inside
+        each = np.unique([int(nested.argmin()) + 1, half, order.size])
+        out = np.zeros((each.size, share.size), dtype=np.bool_)
+        out[:, order] = np.arange(order.size) < each[:, None]
+        return out
+
+    def bound(self) -> tuple[float, Bools]:
+        """Bound of the fits of all sets with amounts of the sign, at most 0, and the meters with the largest.
+
+        The bound holds to the tolerance of the solver.
+        """
+        z = _nonnegative(self.F, self.y, np.zeros(self.y.size), inf)
+        order = np.argsort(-z, kind="stable")
+        inside = np.zeros(z.size, dtype=np.bool_)
+        inside[order[np.cumsum(self.counted[order]) <= self.room]] = True
+        return float(z @ (self.F @ z) - 2.0 * (self.y @ z)), inside & (z > 0.0)
 
     def _share(self, amount: float, start: Floats) -> Floats:
         """Solution of the relaxation, (k,)."""
-        F, y = amount * amount * self.F, amount * self.y
+        return _nonnegative(amount * amount * self.F, amount * self.y, start, 1.0)
 
-        def cost(g: Floats) -> tuple[float, Floats]:
-            rows = F @ g
-            return float(0.5 * (g @ rows) - y @ g), rows - y
 
-        bounds = [(0.0, 1.0)] * y.size
-        found = minimize(
-            cost, start, jac=True, bounds=bounds, method="L-BFGS-B", options={"maxiter": ITERATIONS}
-        )
-        return np.asarray(found.x)
+def _nonnegative(F: Floats, y: Floats, start: Floats, most: float) -> Floats:
+    """Minimum of ``z' F z / 2 - z' y`` over 0 <= z <= most, (k,)."""
+
+    def cost(z: Floats) -> tuple[float, Floats]:
+        rows = F @ z
+        return float(0.5 * (z @ rows) - y @ z), rows - y
+
+    if not y.size:
+        return start
+    bounds = [(0.0, most)] * y.size
+    found = minimize(cost, start, jac=True, bounds=bounds, method="L-BFGS-B", options={"maxiter": ITERATIONS})
+    return np.asarray(found.x)

@@ -129,7 +129,7 @@ def costs(problem: SearchProblem, sets: Bools, share: float = 0.0) -> Floats:
     """
     meters = np.count_nonzero(sets[:, : problem.meters], axis=1)
     out = penalties(problem.meters)[meters] + (problem.charge.max(initial=0.0) if share else 0.0)
-    problem, sets = _among(problem, np.logical_or.reduce(sets, axis=0)), sets[:, sets.any(axis=0)]
+    problem, sets = among(problem, np.logical_or.reduce(sets, axis=0)), sets[:, sets.any(axis=0)]
     p, q, shared = problem.meters, problem.y.size, np.logical_and.reduce(sets, axis=0)
     std = np.where(np.arange(q) < p, np.sqrt(1.0 - share), 1.0) * problem.std
     base = Tableau(replace(problem, std=std)).pivot(shared)
@@ -158,7 +158,7 @@ def mean_likelihood(each: Floats) -> Floats:
     return np.asarray(-2.0 * (np.logaddexp.reduce(-0.5 * each, axis=0) - log(len(each))))
 
 
-def _among(problem: SearchProblem, used: Bools) -> SearchProblem:
+def among(problem: SearchProblem, used: Bools) -> SearchProblem:
     """The problem with some faults (q,) only."""
     at = np.flatnonzero(used)
     return SearchProblem(

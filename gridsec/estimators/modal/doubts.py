@@ -7,8 +7,8 @@ frame does. Each such error d moves the residuals along one known column a, with
 
     m_t = w_t + b_t + e_t + f_t + A_t d_t
 
-The filter treats ``A_t d_t`` as white with `WIDER` times its standard deviation. A tick then says nothing
-along A_t. For one column, with ``q = a' V^-1 a``, a lasting error d leaves
+The filter treats ``A_t d_t`` as white with a multiple of its standard deviation, `WIDER` or `FOLLOWS`. A tick
+then says nothing along A_t. For one column, with ``q = a' V^-1 a``, a lasting error d leaves
 
     a' (V + s^2 a a')^-1 a d = q d / (1 + s^2 q)  <=  d / s^2
 
@@ -59,7 +59,7 @@ FOLLOWS = 3.0
 """Factor on the standard deviation of an injection that follows the estimate, 1. It lasts, and hides faults.
 
 With `WIDER` an injection hides the lies of its neighbours (31 of 39 named on SimBench rural3); with 1 a third
-that drifts moves it farther than that, and an honest meter is named.
+that drifts moves it farther than that, and an honest meter is named. The estimate takes the deviation itself.
 """
 NOTICED = 0.5
 """Change of a voltage, in white deviations, from which on a changed power counts as a load that jumps, 1."""
@@ -83,18 +83,21 @@ class Unknown:
         Effect on the true voltages beyond the model, squared pu.
     meters : (p, k)
         Effect on the residuals, squared pu.
+    factor : (k,)
+        Factor of the filter on the standard deviations, 1.
     unchecked : (p,)
         Meters with a reading that no known power checks.
     """
 
     places: Floats = field(repr=False)
     meters: Floats = field(repr=False)
+    factor: Floats
     unchecked: Bools
 
     @property
     def wide(self) -> Floats:
         """Directions for the filter, (p, k)."""
-        return WIDER * self.meters
+        return self.meters * self.factor
 
 
 def unknown(  # noqa: PLR0917  # the state, and one frame
@@ -120,7 +123,7 @@ def unknown(  # noqa: PLR0917  # the state, and one frame
     skew
         Changes of the voltages within clock offsets.
     """
-    columns = _powers(design, measured, uncertainty, injected, free)
+    columns, factor = _powers(design, measured, uncertainty, injected, free)
     metered = np.asarray(measured.busbar_metered)
     places = design.prior.variance.size
     if not all_of(metered):
@@ -130,12 +133,13 @@ def unknown(  # noqa: PLR0917  # the state, and one frame
     clocks = _clocks(design, measured, skew)
     if not columns and clocks is None:
         return None
-    whole = np.hstack(columns) if columns else np.zeros((places, 0))
+    whole = np.hstack([np.zeros((places, 0)), *columns])
     meters = whole[design.prior.meters]
     if clocks is not None:
         whole = np.hstack([whole, np.zeros((places, clocks.shape[1]))])
         meters = np.hstack([meters, clocks])
-    return Unknown(whole, meters, measured.available & ~uncertainty.vouched[0])
+    factor = np.concatenate([factor, np.full(whole.shape[1] - factor.size, WIDER)])
+    return Unknown(whole, meters, factor, measured.available & ~uncertainty.vouched[0])
 
 
 def reach(design: SequentialDesign) -> Floats:
@@ -223,17 +227,23 @@ def _powers(
     uncertainty: FrameUncertainty,
     injected: Floats,
     free: Bools,
-) -> list[Floats]:
-    """Directions of powers and injections, none or (n, k)."""
+) -> tuple[list[Floats], Floats]:
+    """Directions of powers and injections, none or (n, k), and their factors, (k,)."""
     unsettled, doubt = _unsettled(design, injected, free, measured.uses_q), design.doubt
     if uncertainty.usual and unsettled is None and doubt.sudden_p is None:
-        return []
+        return [], np.zeros(0)
     frame = usual(measured.frame)
     p = _wider(frame.p_error, doubt.smooth_p, uncertainty.p[0] > 1.0, doubt.sudden_p)
     q = _wider(frame.q_error, doubt.smooth_q, uncertainty.q[0] > 1.0, doubt.sudden_q)
-    power = np.concatenate([p, q if unsettled is None else np.hypot(q, unsettled)])
+    power = np.concatenate([p, q])
+    wide = WIDER * power
+    if unsettled is not None:
+        more, factor = unsettled
+        power[p.size :], wide[p.size :] = np.hypot(q, more), np.hypot(WIDER * q, factor * more)
     which = indices(power > 0.0)
-    return [design.sensitivities.numbered(which) * power[which]] if which.size else []
+    if not which.size:
+        return [], np.zeros(0)
+    return [design.sensitivities.numbered(which) * power[which]], wide[which] / power[which]
 
 
 def _wider(error: Floats, known: Floats, wider: Bools, sudden: Floats | None) -> Floats:
@@ -246,17 +256,19 @@ def _wider(error: Floats, known: Floats, wider: Bools, sudden: Floats | None) ->
     return np.where(wider if sudden is None else wider | (sudden > 0.0), np.sqrt(more), 0.0)
 
 
-def _unsettled(design: SequentialDesign, injected: Floats, free: Bools, metered: Bools) -> Floats | None:
-    """Standard deviation of injections known far less well than the design supposes, (N,), pu."""
+def _unsettled(
+    design: SequentialDesign, injected: Floats, free: Bools, metered: Bools
+) -> tuple[Floats, Floats] | None:
+    """Standard deviations of injections that are known badly, (N,), pu, and factors on them, (N,); or None.
+
+    Known badly: far less well than the design supposes, or by the estimate.
+    """
     droop, N = design.plant.droop, design.customers
-    error = droop.per_customer(injected, N)
-    error /= np.sqrt(3.0)
+    error = droop.per_customer(injected, N) / np.sqrt(3.0)
     usually = design.injections + droop.per_customer(design.mismatch, N)
-    out = (error > UNSETTLED * np.maximum(usually, EXACT)) & ~metered
-    if any_of(free):
-        follows = (droop.per_customer(free.astype(np.float64), N) > 0.0) & ~(out | metered)
-        return np.where(out, error, np.where(follows, FOLLOWS / WIDER * error, 0.0))
-    return np.where(out, error, 0.0) if any_of(out) else None
+    far = error > UNSETTLED * np.maximum(usually, EXACT)
+    out = (far | (droop.per_customer(free.astype(np.float64), N) > 0.0)) & ~metered
+    return (np.where(out, error, 0.0), np.where(far, WIDER, FOLLOWS)) if any_of(out) else None
 
 
 def _clocks(design: SequentialDesign, measured: Measurements, skew: ClockSkew | None) -> Floats | None:

@@ -9,7 +9,8 @@ every group is a beginning.
 
 **One amount.** Meters that are off by nearly one amount need one size instead of k. A descent by independent
 amounts does not find them: one amount at a time, none is worth its penalty. `OneAmount` descends with one
-amount for all, from the best set and from the laterals with the best fit. A change by one meter costs O(1).
+amount for all, from the best set and from the laterals with the best fit, in step. A change of a set by one
+meter costs O(1).
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ def _log_binomials(p: int) -> Floats:
 
 
 class OneAmount:
-    """A set of meters with one amount, and the fits of all sets near it.
+    """Sets of meters with one amount each, and the fits of all sets near them. n sets of k meters.
 
     The score and the information of the amount are ``a = 1' y_J`` and ``b = 1' F_JJ 1``:
 
@@ -90,16 +91,16 @@ class OneAmount:
     y, F : (k,), (k, k)
         Scores and information of the meters.
     s2
-        Prior variance s^2 of the amount.
-    inside : (k,)
-        The set.
+        Prior variance s^2 of the amounts.
+    inside : (n, k)
+        The sets.
     """
 
     def __init__(self, y: Floats, F: Floats, s2: float, inside: Bools) -> None:
         self.y, self.F, self.s2, self.inside = y, F, s2, inside.copy()
-        self.rows = F @ self.inside
-        self.a, self.b = float(y @ self.inside), float(self.rows @ self.inside)
-        self.count = int(self.inside.sum())
+        self.own, self.rows = F.diagonal(), inside @ F
+        self.a, self.b = inside @ y, np.vecdot(self.rows, inside)
+        self.count = np.count_nonzero(inside, axis=1)
 
     def fit(self, a: Floats, b: Floats) -> Floats:
         """Fits of sets with scores a and information b."""
@@ -107,92 +108,91 @@ class OneAmount:
         return np.asarray(np.log1p(self.s2 * b) - a * a / (b + 1.0 / self.s2))
 
     def moved(self) -> tuple[Ints, Floats]:
-        """Change of the number by toggling each meter, 1 or -1, and the fit after it, (k,)."""
+        """Change of the numbers by toggling each meter, 1 or -1, and the fits after it, (n, k)."""
         sign = np.where(self.inside, -1, 1)
-        b = self.b + 2.0 * sign * self.rows + self.F.diagonal()
-        return sign, self.fit(self.a + sign * self.y, b)
+        b = self.b[:, None] + 2.0 * sign * self.rows + self.own
+        return sign, self.fit(self.a[:, None] + sign * self.y, b)
 
     @property
-    def cost(self) -> float:
-        """Cost of the set."""
-        return float(self.fit(np.array([self.a]), np.array([self.b]))[0])
+    def cost(self) -> Floats:
+        """Costs of the sets, (n,)."""
+        return self.fit(self.a, self.b)
 
     def toggled(self) -> Floats:
-        """Cost after toggling each meter, (k,)."""
+        """Costs after toggling each meter, (n, k)."""
         return self.moved()[1]
 
     def descend(self) -> Self:
-        """Lower the cost by single meters until none of them helps."""
-        cost = self.cost
-        for _ in range(4 * self.inside.size):
+        """Lower the costs by single meters until none of them helps any set."""
+        cost, every = self.cost, np.arange(len(self.inside))
+        for _ in range(4 * self.y.size):
             one = self.toggled()
-            j = int(one.argmin())
-            if not one[j] < cost - GAIN:
+            j = one.argmin(axis=1)
+            least = one[every, j]
+            at = np.flatnonzero(least < cost - GAIN)
+            if not at.size:
                 break
-            self.toggle(j)
-            cost = float(one[j])
+            self.toggle(at, j[at])
+            cost[at] = least[at]
         return self
 
-    def toggle(self, j: int) -> None:
-        """Add a meter, or remove it."""
-        sign = -1.0 if self.inside[j] else 1.0
-        self.a += sign * float(self.y[j])
-        self.b += 2.0 * sign * float(self.rows[j]) + float(self.F[j, j])
-        self.rows += sign * self.F[j]
-        self.count += int(sign)
-        self.inside[j] = not self.inside[j]
+    def toggle(self, at: Ints, j: Ints) -> None:
+        """Add meters j (m,) to the sets `at` (m,), or remove them; each set once."""
+        sign = np.where(self.inside[at, j], -1, 1)
+        self.a[at] += sign * self.y[j]
+        self.b[at] += 2.0 * sign * self.rows[at, j] + self.own[j]
+        self.rows[at] += sign[:, None] * self.F[j]
+        self.count[at] += sign
+        self.inside[at, j] ^= True
 
 
 class Common(OneAmount):
-    """A lateral with exceptions that is off by one amount, and the costs of all sets near it.
+    """Laterals with exceptions that are off by one amount each, and the costs of all sets near them.
 
-    The cost is the fit with the penalty of `coded` for this lateral, without that of its choice, or with that
+    The cost is the fit with the penalty of `coded` for the lateral, without that of its choice, or with that
     of the number of meters.
 
     Parameters
     ----------
     problem
         The problem.
-    lateral : (p,)
-        Members of the lateral; none: the penalty of the number counts.
-    inside : (p,)
-        The set.
+    laterals : (n, p)
+        Members of the lateral of each set; none: the penalty of the number counts.
+    inside : (n, p)
+        The sets.
     """
 
-    def __init__(self, problem: SearchProblem, lateral: Bools, inside: Bools) -> None:
+    def __init__(self, problem: SearchProblem, laterals: Bools, inside: Bools) -> None:
         p = problem.meters
         super().__init__(problem.y[:p], problem.F[:p, :p], float(problem.std[0]) ** 2, inside)
-        self.penalty, self.lateral = penalties(p), lateral
-        self.size, self.choices = int(lateral.sum()), _log_binomials(p)
+        self.penalty, self.laterals = penalties(p), laterals
+        self.size, self.choices = np.count_nonzero(laterals, axis=1), _log_binomials(p)
         self.read = informed(problem)
-        self.others = int(np.count_nonzero(self.read & ~lateral))
-        self.kept = int(np.count_nonzero(self.inside & lateral))
+        self.others = np.count_nonzero(self.read & ~laterals, axis=1)
+        self.kept = np.count_nonzero(inside & laterals, axis=1)
 
     def _charged(self, fit: Floats, count: Ints, kept: Ints) -> Floats:
-        """Costs of sets by their fits, numbers of meters, and numbers of those of the lateral."""
-        if self.size:
-            left, other = self.choices[self.size], self.choices[self.others]
-            out = fit + 2.0 * (left[self.size - kept] + other[count - kept])
-        else:
-            out = fit + self.penalty[count]
+        """Costs by fits, numbers of meters, and numbers of those of the laterals, (n, l) each."""
+        size, others = self.size[:, None], self.others[:, None]
+        choice = 2.0 * (self.choices[size, size - kept] + self.choices[others, count - kept])
+        out = fit + np.where(size > 0, choice, self.penalty[count])
         return np.where(count > 0, out, inf)
 
     @property
-    def cost(self) -> float:
-        """Cost of the set, without that of the choice of the lateral."""
-        each = np.array([super().cost]), np.array([self.count]), np.array([self.kept])
-        return float(self._charged(*each)[0])
+    def cost(self) -> Floats:
+        """Costs of the sets, without those of the choice of the laterals, (n,)."""
+        return self._charged(super().cost[:, None], self.count[:, None], self.kept[:, None])[:, 0]
 
     def toggled(self) -> Floats:
-        """Cost after toggling each meter, (p,)."""
+        """Costs after toggling each meter, (n, p)."""
         sign, fit = self.moved()
-        out = self._charged(fit, self.count + sign, self.kept + sign * self.lateral)
+        out = self._charged(fit, self.count[:, None] + sign, self.kept[:, None] + sign * self.laterals)
         return np.where(self.read, out, inf)
 
-    def toggle(self, j: int) -> None:
-        """Add a meter, or remove it."""
-        self.kept += int(self.lateral[j]) * (-1 if self.inside[j] else 1)
-        super().toggle(j)
+    def toggle(self, at: Ints, j: Ints) -> None:
+        """Add meters, or remove them."""
+        self.kept[at] += self.laterals[at, j] * np.where(self.inside[at, j], -1, 1)
+        super().toggle(at, j)
 
 
 def in_common(problem: SearchProblem, laterals: Floats, best: Bools) -> Bools:
@@ -208,20 +208,20 @@ def in_common(problem: SearchProblem, laterals: Floats, best: Bools) -> Bools:
         The best set with independent amounts.
     """
     p, out = problem.meters, dict[bytes, Bools]()
-    none = np.zeros(p, dtype=np.bool_)
-    starts = [Common(problem, none, best[:p] & informed(problem))] if best[:p].any() else []
+    some, starts = np.zeros((0, p), dtype=np.bool_), best[None, :p] & informed(problem)
     if len(laterals):
         a, b = laterals @ problem.y[:p], ((laterals @ problem.F[:p, :p]) * laterals).sum(axis=1)
         first = a * a / (np.maximum(b, 0.0) + problem.std[0] ** -2.0)
-        for k in np.argsort(-first, kind="stable")[:_COMMON]:
-            lateral = laterals[k] > 0.0
-            starts.append(Common(problem, lateral, lateral))
-    for start in starts:
-        end = start.descend()
-        near = end.toggled() < end.cost - 2.0 * log(BELIEVED)
-        for j in (-1, *np.flatnonzero(near)):
+        some = laterals[np.argsort(-first, kind="stable")[:_COMMON]] > 0.0
+    if not best[:p].any():
+        starts = starts[:0]
+    none = np.zeros_like(starts)
+    end = Common(problem, np.vstack([none, some]), np.vstack([starts, some])).descend()
+    near = end.toggled() < (end.cost - 2.0 * log(BELIEVED))[:, None]
+    for inside, others in zip(end.inside, near, strict=True):
+        for j in (-1, *np.flatnonzero(others)):
             chosen = np.zeros(problem.y.size, dtype=np.bool_)
-            chosen[:p] = end.inside
+            chosen[:p] = inside
             if j >= 0:
                 chosen[j] = not chosen[j]
             out[chosen.tobytes()] = chosen

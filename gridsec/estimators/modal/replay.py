@@ -147,10 +147,11 @@ def replayed(modes: Modes, history: History, onsets: Onsets, rows: Sequence[int]
     onsets, rows
         The onsets of the detector after the last reading, and the rows.
     """
-    count, (state, known, *_) = len(history.readings), history.start
+    count = len(history.readings)
+    kept, (state, known, *_) = history.until(max(0, count - max(int(onsets.age[row]) for row in rows)))
     t, full = state.t, exact.expanded(modes, state, known) if state.full is None else state.full
-    out = {row: begun(modes, row, bool(onsets.ramp[row])) for row in rows}
-    for k, (now, m, seen, unknown, jump) in enumerate(history.readings):
+    out, first = {row: begun(modes, row, bool(onsets.ramp[row])) for row in rows}, len(kept.readings)
+    for k, (now, m, seen, unknown, jump) in enumerate(history.readings[first:], first):
         gap = Interval(now - t, jump)
         full, innovation = exact.updated(modes, full, gap, m, seen, unknown)
         for row in rows:

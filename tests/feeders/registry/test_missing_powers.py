@@ -147,6 +147,13 @@ def test_colluding_meters_that_withhold_powers_are_never_clean_beyond_the_bound(
     assert max(off) < 4.0
 
 
+MIXED = {(MODAL, beyond): 6.5}
+"""Largest errors that differ, in standard deviations.
+
+For four UNDECIDED ticks `modal` mixes explanations that are all wrong: the true one is not met before.
+"""
+
+
 @pytest.mark.canary("sequential-late", "modal-late")
 @pytest.mark.parametrize("how", [absurd, beyond, late])
 @pytest.mark.parametrize("estimator", [SEQUENTIAL, MODAL])
@@ -159,7 +166,7 @@ def test_powers_that_are_worth_nothing_are_as_good_as_withheld_ones(
             wrong = error(sample, estimate)
             assert verdict.decision is not Decision.CLEAN
             assert (wrong <= estimate.bound).all()
-            assert (wrong <= 4.0 * estimate.std).all()
+            assert (wrong <= MIXED.get((estimator, how), 4.0) * estimate.std).all()
 
 
 @pytest.mark.canary("sequential-1-0", "modal-1-0")

@@ -8,6 +8,7 @@ from math import inf
 
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.modal import collusion
@@ -113,7 +114,24 @@ def test_a_relaxation_of_too_many_meters_is_solved_for_larger_amounts(amount: fl
     assert relaxed._share(amount, np.full(p, 0.5)).sum() > 7.0
     least, inside = relaxed.best(amount)
     assert (inside == lie).all()
-    assert least == collusion._Limited(relaxed, lie).cost
+    assert least == collusion._Limited(relaxed, lie[None]).cost[0]
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_bound_is_that_of_all_amounts_of_the_sign(seed: int, sign: float) -> None:
+    """Against nonnegative least squares, and below the fits of all sets that a search finds."""
+    given, own = street(0.8 * some(0, 1, 2, 3).astype(np.float64), seed), np.append(some(7), False)
+    at, y, F = collusion._beside(given, own, ~own[:METERS])
+    relaxed = collusion._Relaxed(sign * y, F, 1.0, np.ones(at.size, dtype=np.bool_), 4)
+    root = np.linalg.cholesky(F)
+    aim = np.linalg.solve(root, sign * y)
+    rest = nnls(root.T, aim)[1]
+    bound, inside = relaxed.bound()
+    assert np.isclose(bound, rest**2 - aim @ aim, rtol=1e-5, atol=1e-6)
+    assert bound <= relaxed.best(0.5)[0]
+    order = np.argsort(-nnls(root.T, aim)[0], kind="stable")
+    assert set(np.flatnonzero(inside)) <= set(order[:4])
 
 
 def test_an_honest_meter_amid_colluding_ones_is_contested() -> None:

@@ -12,14 +12,20 @@ from gridsec.estimators.modal.costs import SearchProblem
 from gridsec.estimators.modal.doubts import Unknown
 from gridsec.estimators.modal.model import modes
 from gridsec.estimators.modal.signatures import Joint
+from gridsec.estimators.sequential.measurements import measurements, nominal_uncertainty
+from gridsec.grid.network import Power
 from tests.gridsec.estimators.modal.test_core import MODEL
 from tests.gridsec.estimators.modal.test_filter import proportional
+from tests.gridsec.estimators.sequential.test_monitor import prepare
+from tests.gridsec.street import Street, make_plant
 
 STEPS = power_columns(tree(12, np.random.default_rng(3)))[:, :12]
 COLUMN = STEPS[:, [7]]
 """Effect of one customer's active power on the meters."""
 POWER = 0.03
 """An unread power, pu: 3 kW."""
+WIDE = np.full(2, doubts.WIDER)
+"""Factors of two directions."""
 
 
 def test_the_filter_is_the_dense_one_with_more_noise() -> None:
@@ -56,11 +62,34 @@ def test_a_lasting_error_along_an_unknown_direction_is_no_evidence() -> None:
     assert played(None, error) > 0.0
 
 
+def test_an_injection_that_follows_the_estimate_is_wider_by_its_own_factor() -> None:
+    """Its own deviation in the estimate, `FOLLOWS` times that in the filter; far ones `WIDER` times."""
+    plant = make_plant(np.random.default_rng(5), customers=12, drop=0.08)
+    front, street = prepare(plant), Street(plant, np.random.default_rng(6))
+    droop, one = plant.droop, np.ones(12, dtype=np.bool_)
+    measured = measurements(front, street.frame(), one, one[:1], 1.0)
+    usual = np.sqrt(3.0) * (front.injections[droop.customer] + front.mismatch)
+    injected, free = 2.0 * usual, np.zeros(droop.customer.size, dtype=np.bool_)
+    injected[1] *= doubts.UNSETTLED
+    free[:2] = True
+    given = doubts.unknown(front, measured, nominal_uncertainty(front), injected, free, None)
+    assert given is not None
+    columns = front.sensitivities.columns(Power.REACTIVE, droop.customer[:2])
+    exact = columns * injected[:2] / np.sqrt(3.0)
+    order = np.argsort(droop.customer[:2])
+    assert np.allclose(given.places, exact[:, order])
+    assert np.allclose(given.factor, np.array([doubts.FOLLOWS, doubts.WIDER])[order])
+    assert np.allclose(given.wide, given.factor * given.meters)
+    assert (
+        doubts.unknown(front, measured, nominal_uncertainty(front), 2.0 * usual, ~free & free, None) is None
+    )
+
+
 def test_the_estimate_is_the_gaussian_one() -> None:
     """Mean and variance equal those of dense conditioning; unchecked readings widen the variance only."""
     made, random = modes(MODEL), np.random.default_rng(3)
     places, at = random.standard_normal((13, 2)) * 0.01, MODEL.meters
-    given = Unknown(places, places[at], np.zeros(12, dtype=np.bool_))
+    given = Unknown(places, places[at], WIDE, np.zeros(12, dtype=np.bool_))
     u, seen = 0.01 * random.standard_normal(12), np.arange(12) != 5
     mean, variance = doubts.estimated(made, given, u, seen)
     whole = np.block(
@@ -73,7 +102,7 @@ def test_the_estimate_is_the_gaussian_one() -> None:
     gain = np.linalg.solve(whole[np.ix_(n, n)], whole[n, :13]).T
     assert np.allclose(mean, gain @ u[seen])
     assert np.allclose(variance, np.diag(whole)[:13] - np.diag(gain @ whole[n, :13]), atol=1e-12)
-    doubted = Unknown(places, places[at], np.arange(12) == 2)
+    doubted = Unknown(places, places[at], WIDE, np.arange(12) == 2)
     same, wider = doubts.estimated(made, doubted, u, seen)
     other, less = doubts.estimated(made, given, u, seen & (np.arange(12) != 2))
     assert np.allclose(same, mean)
@@ -84,7 +113,7 @@ def test_the_estimate_is_the_gaussian_one() -> None:
 def test_without_readings_nothing_is_known() -> None:
     """The variance is that of the directions."""
     places = np.ones((13, 1))
-    given = Unknown(places, places[MODEL.meters], np.zeros(12, dtype=np.bool_))
+    given = Unknown(places, places[MODEL.meters], WIDE[:1], np.zeros(12, dtype=np.bool_))
     mean, variance = doubts.estimated(modes(MODEL), given, np.ones(12), np.zeros(12, dtype=np.bool_))
     assert not mean.any()
     assert np.allclose(variance, 1.0)

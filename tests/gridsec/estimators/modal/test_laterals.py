@@ -36,13 +36,15 @@ def test_costs_of_one_amount_are_exact(seed: int, whole: bool) -> None:
         exceptions = 2.0 * np.log(comb(5, kept) * comb(p - 5, k - kept)) if whole else penalties(p)[k]
         return cost(one, np.ones(1, dtype=np.bool_)) + exceptions
 
-    common = Common(given, lateral, random.random(p) < 0.4)
+    common = Common(given, np.stack([lateral] * 3), random.random((3, p)) < 0.4)
     before = common.cost
-    for j, found in enumerate(common.toggled()):
-        assert found == pytest.approx(exact(common.inside ^ (np.arange(p) == j)), abs=1e-8)
+    for inside, each in zip(common.inside, common.toggled(), strict=True):
+        for j, found in enumerate(each):
+            assert found == pytest.approx(exact(inside ^ (np.arange(p) == j)), abs=1e-8)
     common.descend()
-    assert common.cost <= before
-    assert common.cost == pytest.approx(exact(common.inside), abs=1e-8)
+    assert (common.cost <= before).all()
+    for inside, cost_of in zip(common.inside, common.cost, strict=True):
+        assert cost_of == pytest.approx(exact(inside), abs=1e-8)
 
 
 def test_a_lateral_with_exceptions_has_the_least_penalty() -> None:
