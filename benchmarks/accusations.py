@@ -1,7 +1,7 @@
 """Honest meters accused by an estimator: situations, feeders, learned errors or not, powers unread.
 
     python -m benchmarks.accusations [--runs 20] [--processes 1] [--situation NAME ...] [--seed0 0]
-        [--feeder NAME] [--model NAME] [--learned yes|no] [--estimator NAME] [--trace]
+        [--feeder NAME] [--model NAME] [--learned yes|no] [--size S] [--estimator NAME] [--trace]
 
 Every run has 20 honest seconds and 90 seconds of a manipulation, one frame per second, AC power flow as the
 truth. Situation and seed determine the run: feeder, learned errors (six hours, a tick of 300 s) or accuracy
@@ -13,8 +13,9 @@ checks beside those. `--estimator modal` watches the same data; the linear progr
 
 Per situation: runs; runs with an honest meter accused; most honest meters accused in a run; runs with an
 honest busbar meter or inverter accused; ticks CLEAN, UNDECIDED and ATTACKED after the onset, %; manipulated
-meters named, %; largest error over the stated standard deviation and over the stated bound; largest error at
-CLEAN, V. Exits 1 when an honest meter is accused. With `--trace` every tick of every run is printed.
+meters named, %; seconds from the onset until all of a run are named, where all are; largest error over the
+stated standard deviation and over the stated bound; largest error at CLEAN, V. Exits 1 when an honest meter
+is accused. With `--trace` every tick of every run is printed.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache, partial
+from math import inf
 
 # Before NumPy loads its libraries.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -267,6 +269,8 @@ class Run:
         Ids of honest meters ever named, manipulated meters, and those of them that were named.
     others
         Ticks with an honest busbar meter or an honest inverter named.
+    settled
+        Time from the onset until all manipulated meters have been named, s; infinite where one is not.
     ratio, bound, volt, clean_volt, lie_volt
         Error over standard deviation, over bound; error, error at CLEAN, and lie, V.
     trace
@@ -281,6 +285,7 @@ class Run:
     manipulated: tuple[str, ...] = ()
     named: tuple[str, ...] = ()
     others: int = 0
+    settled: float = inf
     ratio: float = 0.0
     bound: float = 0.0
     volt: float = 0.0
@@ -333,6 +338,8 @@ def run(
         manipulated |= truth.liars
         accused |= verdict.suspects & ~truth.liars
         named |= verdict.suspects & truth.liars
+        if out.settled == inf and np.array_equal(named, manipulated):
+            out.settled = frame.t - T_ON
         _tick(out, where, estimate, verdict, truth, honest_busbar=not off)
         if trace:
             out.trace.append(_line(where, frame, estimate, verdict, truth))
@@ -384,10 +391,12 @@ def table(runs: list[Run]) -> str:
     named = f"{100.0 * sum(len(one.named) for one in runs) / liars:.0f}" if liars else ""
     most = max(len(one.accused) for one in runs)
     by = dict(zip(Decision, share, strict=True))
-    shares = " | ".join(f"{by[k]:.0f}" for k in (Decision.CLEAN, Decision.UNDECIDED, Decision.ATTACKED))
+    shares = " | ".join(f"{by[k]:.1f}" for k in (Decision.CLEAN, Decision.UNDECIDED, Decision.ATTACKED))
     worst = [max(getattr(one, name) for one in runs) for name in ("ratio", "bound", "clean_volt")]
     seconds = float(np.mean([one.seconds for one in runs]))
     cells_ = [runs[0].situation, len(runs), bad, most, sum(bool(one.others) for one in runs), shares, named]
+    settled = max(one.settled for one in runs)
+    cells_ += [f"{settled:.0f}" if settled < inf else "-"]
     cells_ += [f"{worst[0]:.1f}", f"{worst[1]:.2f}", f"{worst[2]:.2f}", f"{seconds:.2f}"]
     return f"| {' | '.join(map(str, cells_))} |"
 
@@ -395,13 +404,14 @@ def table(runs: list[Run]) -> str:
 def seeds(name: str, asked: argparse.Namespace) -> Iterator[int]:
     """Seeds of the runs that pass the filters."""
     every = range(asked.seed0, asked.seed0 + asked.runs * len(cells(name, asked.feeder)))
-    passing = (seed for seed in every if _passes(cell(name, seed, asked.feeder)[0], asked))
+    passing = (seed for seed in every if _passes(*cell(name, seed, asked.feeder), asked))
     return itertools.islice(passing, asked.runs)
 
 
-def _passes(setting: Setting, asked: argparse.Namespace) -> bool:
+def _passes(setting: Setting, size: float, asked: argparse.Namespace) -> bool:
     return (
-        asked.feeder in (None, setting.feeder)
+        asked.size in (None, size)
+        and asked.feeder in (None, setting.feeder)
         and asked.model in (None, setting.model)
         and asked.learned in (None, "yes" if setting.learned else "no")
     )
@@ -413,8 +423,8 @@ def main(asked: argparse.Namespace) -> int:
         "| situation | runs | accusing runs | most accused | busbar, inverter | clean % | undecided % |",
         end="",
     )
-    print(" attacked % | named % | error / std | error / bound | V at clean | s per run |")
-    print("|" + "---|" * 13, flush=True)
+    print(" attacked % | named % | all after s | error / std | error / bound | V at clean | s per run |")
+    print("|" + "---|" * 14, flush=True)
     failed: list[Run] = []
     names = asked.situation or list(SITUATIONS)
     with ProcessPoolExecutor(asked.processes) as pool:
@@ -428,7 +438,7 @@ def main(asked: argparse.Namespace) -> int:
                 )
             )
             if not runs:
-                print(f"| {name} | 0 |" + " |" * 11)
+                print(f"| {name} | 0 |" + " |" * 12)
                 continue
             print(table(runs), flush=True)
             wrong = [one for one in runs if one.accused]
@@ -453,6 +463,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--feeder")
     parser.add_argument("--model", choices=[str(each) for each in Model])
     parser.add_argument("--learned", choices=["yes", "no"])
+    parser.add_argument("--size", type=float)
     parser.add_argument("--estimator", default=SEQUENTIAL, choices=(SEQUENTIAL, MODAL))
     parser.add_argument("--trace", action="store_true")
     return parser
