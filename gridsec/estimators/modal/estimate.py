@@ -138,7 +138,7 @@ def _factors(matrix: Floats) -> tuple[Floats, Floats]:
     """Factors (n, k) and (k, m) of a matrix of rank k, to rounding."""
     left, size, right = np.linalg.svd(matrix, full_matrices=False)
     k = int(np.count_nonzero(size > ROUNDING * size.max(initial=0.0)))
-    return left[:, :k] * size[:k], np.ascontiguousarray(right[:k])
+    return left[:, :k] * size[:k], right[:k].copy()
 
 
 def honest(

@@ -19,9 +19,11 @@ martingale without a fault. ``exp(y f - I f^2 / 2)`` has the mean 1 for ``I = su
 1 for any larger I. So signatures that are diagonal in the modes stay in use. Their gain is that of a
 covariance of which the diagonal is kept at every tick; its error costs evidence, and causes no false alarm.
 
-**Return.** After `COMPLETE` ticks with all readings the filter returns to the modes. The condition: their
-diagonal covariance C, enlarged by `MARGIN`, is an upper bound, ``(1 + MARGIN) C + T N T' >= P``, with N of
-the information in the directions divided by ``(1 + MARGIN)^2``.
+**Return.** After ticks with all readings the filter returns to the modes. The condition: their diagonal
+covariance C, enlarged by e, is an upper bound, ``(1 + e) C + T N T' >= P``, with N of the information in the
+directions divided by ``(1 + e)^2``. It is tried at every `COMPLETE`-th complete tick, and later at every
+`LONGEST`-th. e grows to `MARGIN` over `LONGEST` ticks: returns enlarge the covariance by no more per tick,
+however often readings are lost.
 The readings then have at most the covariance of the model in use. With scores y and information I of that
 model, ``var y <= I`` without a fault, and ``E exp(y f - I f^2 / 2) <= 1`` at each fixed tick.
 
@@ -46,12 +48,12 @@ from gridsec.estimators.modal.filter import FilterState, Full, Innovation, Inter
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.static import Static
 
-COMPLETE = 64
-"""Ticks with all readings before a return to the modes, and from one attempt to the next."""
+COMPLETE, LONGEST = 16, 64
+"""Complete ticks from one attempt to return to the modes to the next: at first, and from the largest e on."""
 SHARED = 16
 """Ticks for which the gain of the signatures is scaled alike while the same members report."""
 MARGIN = 0.1
-"""Enlargement of the variance at the return, 1: standard deviations are too large by 5 % at first."""
+"""Largest enlargement of the variance at a return, 1: standard deviations are too large by 5 % at first."""
 
 
 def step(  # noqa: PLR0917  # the states of both parts, and one tick
@@ -92,7 +94,7 @@ def step(  # noqa: PLR0917  # the states of both parts, and one tick
         If t is before the last reading or not a number.
     """
     whole = (seen is None or all_of(seen)) and unknown is None
-    if state.full is not None and whole and not stay and state.full.complete >= COMPLETE:
+    if state.full is not None and whole and not stay and _due(state.full.complete):
         state, known = _returned(modes, state, state.full, known)
     if state.full is None and not whole:
         state = replace(state, full=expanded(modes, state, known))
@@ -246,24 +248,30 @@ def _share(modes: Modes, before: Full, update: Update) -> tuple[Floats | None, i
     return np.clip(1.0 - (spread * spread).sum(axis=0) / v, 0.0, 1.0), 0
 
 
+def _due(complete: int) -> bool:
+    """An attempt to return is due after a number of complete ticks."""
+    return complete > 0 and complete % (COMPLETE if complete < LONGEST else LONGEST) == 0
+
+
 def _returned(modes: Modes, state: FilterState, full: Full, known: Static) -> tuple[FilterState, Static]:
-    """State of the modal filter, if its covariance is an upper bound; else the same, and a later attempt."""
+    """State of the modal filter, if its covariance is an upper bound; else the same."""
     t, U, known = modes.size, modes.U, static.current(modes, known)
+    larger = 1.0 + MARGIN * min(1.0, full.complete / LONGEST)
     T = _turned(modes, known).reshape(2, t, -1)
     T = np.vstack([U.T @ T[0], U.T @ T[1]])
     of_w, both, of_b = (U.T @ each @ U for each in full.blocks)
     P = np.block([[of_w, both], [both.T, of_b]])
     # The information of complete readings is more than that of theta.
-    now = static.current(modes, replace(known, information=known.information / (1.0 + MARGIN) ** 2))
+    now = static.current(modes, replace(known, information=known.information / larger**2))
     rest, bound = P - T @ known.cov @ T.T, T @ now.cov @ T.T - P
     w, b = np.arange(t), np.arange(t, 2 * t)
-    cov = (1.0 + MARGIN) * np.stack([rest[w, w], rest[w, b], rest[b, b]])
+    cov = larger * np.stack([rest[w, w], rest[w, b], rest[b, b]])
     bound[w, w] += cov[0]
     bound[w, b] += cov[1]
     bound[b, w] += cov[1]
     bound[b, b] += cov[2]
     _, failed = lapack.dpotrf(bound, lower=True)
     if failed or not (cov[0] > 0.0).all() or not (cov[0] * cov[2] > cov[1] ** 2).all():
-        return replace(state, full=replace(full, complete=0)), known
+        return state, known
     mean = full.mean @ U - (T @ now.theta).reshape(2, t)
     return FilterState(state.t, mean, cov), static.restored(modes, now)

@@ -150,7 +150,7 @@ def test_missing_readings_are_exact(make: object, kind: str) -> None:
 
 @pytest.mark.parametrize("make", [model_of, mixed])
 def test_the_return_to_the_modes_is_an_upper_bound(make: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After readings without a gap the modes take over: means exact, covariance 1.1 times as large."""
+    """After readings without a gap the modes take over: means exact, covariance up to 1.1 times as large."""
     monkeypatch.setattr(full, "COMPLETE", 10)
     model = model_of(tree(12, np.random.default_rng(3))) if make is model_of else mixed()
     made, source = modes(model), Source(model, np.random.default_rng(5))
