@@ -27,12 +27,13 @@ has the relaxation
 
     minimise  x^2 g' F g / 2 - x y' g,      0 <= g <= 1,      g = 0 on C
 
-which is convex [1]_. With any amounts it is a minimum over z >= 0 of all meters outside of C, ``z' F z / 2 -
-z' y``, a bound. Where the bound exceeds the limit of a naming, the meters with the largest z are the only g.
-Elsewhere the relaxation's solution orders the meters. The best beginning of this order is improved by single
-meters and by exchanges. x is first the mean amount of C, then that of the set found. Where that gains nothing
-and the solution has more meters than the promise, x is larger. g is also looked for in place of the rest's
-meters of its own sign, since colluding meters may share one amount.
+which is convex [1]_. With any amounts of the sign, and independent ones of the rest, it is a minimum over
+z >= 0 of all meters outside of C, ``z' F z / 2 - z' y``, a bound. Where that is above the limit of a naming,
+the meters with the largest z are the only g. Elsewhere the relaxation's solution orders the meters. The best
+beginning of this order is improved by single meters and by exchanges. x is first the mean amount of C, then
+that of the set found. Where that gains nothing and the solution has more meters than the promise, x is
+larger. g is also looked for in place of the rest's meters of its own sign, since colluding meters may share
+one amount, and of its faults that are no meters.
 
 References
 ----------
@@ -74,6 +75,10 @@ LARGER = 1.5
 """Next amount over the largest one tried where the relaxation has more meters than are promised, 1."""
 ITERATIONS = 300
 """Largest number of iterations of the relaxation; most take below 100."""
+_COUNTS = -2.0 * log(2.0 * DOUBT)
+"""Largest cost of a set that contests a name: twice the weight from which on a set counts in the variance."""
+ALIKE_LESS = 3.0
+"""Amount by which L with amounts alike may be below the bound of independent ones, 1: 2 log 2, and more."""
 HALF = 0.5
 """Share from which on a meter is in the set of the relaxation, and at its start, 1."""
 
@@ -117,8 +122,8 @@ def weighed(found: Identification, masked: Bools, near: Neighbourhoods) -> Ident
         if more < limit:
             contested |= accused & named
             key = other.tobytes()
-            # No more than J: few meters are likelier than many.
-            cost = by_model[model][J.tobytes()] + max(more, GAIN)
+            # No more than J: few meters are likelier than many. What keeps names back counts in the estimate.
+            cost = min(by_model[model][J.tobytes()] + max(more, GAIN), _COUNTS)
             by_model[model][key] = min(cost, by_model[model].get(key, inf))
         elif splits:
             parts += [(sign, part, splits - 1) for part in _split(accused, near.laterals)]
@@ -154,7 +159,8 @@ def _instead(  # noqa: PLR0917  # one explanation
     size = float(np.abs(amount[:p][accused]).mean())
     yield without, rest
     kept = []
-    fewer = [(_without(rest, sign * amount[:p] > 0.0), (sign,)) for sign in _SIGNS]
+    fewer: list[tuple[Bools, tuple[float, ...]]] = [(rest & (np.arange(rest.size) < p), _SIGNS)]
+    fewer += [(_without(rest, sign * amount[:p] > 0.0), (sign,)) for sign in _SIGNS]
     for each, signs in [(rest, _SIGNS), *(one for one in fewer if not np.array_equal(one[0], rest))]:
         at, y, F = _beside(problem, each, ~(each[:p] | accused))
         room = most - int(np.count_nonzero(each[:p] | masked))
@@ -162,13 +168,15 @@ def _instead(  # noqa: PLR0917  # one explanation
         for sign in signs:
             one = _Relaxed(sign * y, F, float(problem.std[0]) ** 2, ~masked[at], room)
             least, inside = one.bound()
-            if begun + least < limit:
+            searched = begun + least < limit + ALIKE_LESS
+            if searched:
                 least, inside = one.best(size)
             if any_of(inside):
                 both = each.copy()
                 both[at[inside]] = True
-                yield begun + least, both
                 kept.append(both)
+                if searched:
+                    yield begun + least, both
     if kept:
         yield from zip(_evidence(problem, np.stack(kept)).tolist(), kept, strict=True)
 

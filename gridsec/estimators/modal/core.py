@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from math import inf, log
+from math import inf, log, sqrt
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -74,6 +74,8 @@ EXPLAINED = 0.25
 
 A lasting fault explains all of it, one that grows since the onset three quarters, and alternating ones none.
 """
+BY_CHANCE = 3.0
+"""Misfit that needs no explanation, in standard deviations of n honest innovations, ``sqrt(2 n)``, 1."""
 OFTEN = 0.3
 """Share of the last ticks with a jump of the loads from which on jumps explain everything, and so nothing, 1.
 
@@ -420,7 +422,8 @@ def again(
     for k in range(len(kept.readings), len(history.readings)):
         t, m, seen, unknown, jump = history.readings[k]
         now, evidence = step(core, now, t, m, *change(k, seen, unknown), jump)
-    return now, evidence
+    # The loads have varied once.
+    return replace(now, loads=state.loads), evidence
 
 
 def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
@@ -538,20 +541,24 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     if best:
         found = _searched(core, state, rows[best], known)
     found = collusion.weighed(mirrors.reflected(found, core.near), state.masked.meters, core.near)
-    fits = _fits(state, found)
+    fits = _fits(state, found, int(test.onsets.age[rows[best]]))
     return Suspicion(rows[best], found if fits else replace(found, named=np.zeros_like(found.named)), fits)
 
 
-def _fits(state: CoreState, found: Identification) -> bool:
-    """The best explanation takes enough of the misfit away, by the model of the loads or a steady rival."""
+def _fits(state: CoreState, found: Identification, age: int) -> bool:
+    """The best explanation takes enough of the misfit away, by the model of the loads or a steady rival.
+
+    Of an onset before the kept readings, a gain in proportion to their number is compared.
+    """
     if not state.rivals:
         return True
     for at in dict.fromkeys((0, int((found.model == 0).argmax()))):
         number, chosen = int(found.model[at]), found.chosen[at]
         problem, model = found.problems[number], state.rivals[number]
         # Twice the logarithm of a ratio of likelihoods.
-        gain = float(problem.y[chosen] @ mean_amounts(problem, chosen))
-        if gain >= EXPLAINED * model.misfit and (number == 0 or model.unsteady < OFTEN):
+        gain = float(problem.y[chosen] @ mean_amounts(problem, chosen)) * min(1.0, model.ticks / age)
+        chance = BY_CHANCE * sqrt(2.0 * model.count)
+        if gain >= EXPLAINED * (model.misfit - chance) and (number == 0 or model.unsteady < OFTEN):
             return True
     return False
 

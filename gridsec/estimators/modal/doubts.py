@@ -12,7 +12,8 @@ then says nothing along A_t. For one column, with ``q = a' V^-1 a``, a lasting e
 
     a' (V + s^2 a a')^-1 a d = q d / (1 + s^2 q)  <=  d / s^2
 
-per tick in the score, in place of ``q d``: nothing accumulates, whatever the correlation in time. The price
+per tick in the score, in place of ``q d``, s including the factor: next to nothing accumulates, whatever the
+correlation in time. The price
 is evidence against a fault along a. It is unavoidable where the error may last.
 
 The estimate uses the standard deviations themselves: d is estimated from the residuals of the same tick,

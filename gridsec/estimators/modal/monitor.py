@@ -476,7 +476,8 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
     doubtful = suspected or any_of(beyond)
     trust = _trust(design, now, named, state.suspicion)
     # While the readings disagree and no search has settled it, no reading bounds a voltage.
-    sure = np.zeros_like(seen) if doubtful else trust.trust.trusted & seen
+    unsure = doubtful or _hidden(kernel, tick.unknown)
+    sure = np.zeros_like(seen) if unsure else trust.trust.trusted & seen
     estimate, spread = _estimate(design, state if trust is now else changed(state, front=trust), tick, sure)
     busbar = _busbar(design, now, tick, estimate, spread)
     evidence = verdict.meter_evidence(
@@ -548,6 +549,12 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
     return (out if learning is None else _learned(design, out)), estimate, answer
 
 
+def _hidden(kernel: CoreState, unknown: Unknown | None) -> bool:
+    """Meters that collude with suspected or named ones may hide behind powers without a reading."""
+    open_ = unknown is not None and any_of(unknown.unchecked)
+    return open_ and (any_of(kernel.detector.pinned) or any_of(kernel.masked.meters))
+
+
 def _doubtful(kernel: CoreState) -> bool:
     """The readings disagree, or a meter exceeds its class: nothing is learned, and no reading is a bound."""
     return any_of(kernel.detector.pinned) or any_of(kernel.exceeding)
@@ -609,7 +616,10 @@ def _estimate(
             plain = core.estimate(kernel, state.core)
             u = u - (mean - plain.mean)[front.prior.meters]
             read = read & ~verdict.accused(kernel, state.suspicion)
-        off, more = doubts.estimated(kernel.modes, tick.unknown, u, read)
+        given = tick.unknown
+        if all_of(np.asarray(measured.busbar_metered)) and _hidden(state.core, given):
+            given = replace(given, unchecked=read)
+        off, more = doubts.estimated(kernel.modes, given, u, read)
         mean = mean + off
     v2_bus, first = tick.predicted.v2_bus + mean, plant.feeder.busbar_places()
     metered = measured.busbar_metered

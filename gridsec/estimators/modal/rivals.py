@@ -78,8 +78,9 @@ class Rival:
         Number of jumps; None where the loads never jump.
     unsteady
         Share of the last ticks with a jump, 1: a mean with the memory of `RECENT` ticks.
-    misfit
-        Squares of the whitened innovations since the onset, less their expectation without a fault.
+    misfit, count, ticks
+        Squares of the whitened innovations since the onset, less their number; that number, and their ticks.
+        Those before the kept readings do not count.
     update
         The filter's last step.
     loads
@@ -96,6 +97,8 @@ class Rival:
     jumps: int | None
     unsteady: float = 0.0
     misfit: float = 0.0
+    count: int = 0
+    ticks: int = 0
     update: Update | None = None
     loads: float = 1.0
 
@@ -240,6 +243,8 @@ def follow(  # noqa: PLR0917  # the state, and one tick
         jumps=jumps,
         unsteady=before.unsteady + (float(size > 0.0) - before.unsteady) / RECENT,
         misfit=square - count + (0.0 if begun else before.misfit),
+        count=count + (0 if begun else before.count),
+        ticks=1 + (0 if begun else before.ticks),
         update=update,
         loads=loads,
     )

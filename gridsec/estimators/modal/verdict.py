@@ -278,7 +278,7 @@ def combined(
 ) -> tuple[Explanation, ...]:
     """Explanations of the voltages and of metered reactive powers together, the likeliest first.
 
-    Both are independent: probabilities multiply, and equal sets are one.
+    Both are taken for independent, though of the same residuals: probabilities multiply. Equal sets are one.
 
     Parameters
     ----------
@@ -288,7 +288,7 @@ def combined(
         Inverters that are named in any case.
     """
     none = np.zeros_like(inverters)
-    if cases or any_of(inverters):
+    if rivals and (cases or any_of(inverters)):
         together: dict[bytes, Explanation] = {}
         for one in rivals:
             for case in cases or (Explanation(one.meters, none, 1.0, one.powers),):
@@ -298,7 +298,7 @@ def combined(
                 share = one.probability * case.probability
                 share += together[key].probability if key in together else 0.0
                 together[key] = replace(one, meters=meters, powers=powers, inverters=also, probability=share)
-        rivals = tuple(sorted(together.values(), key=lambda each: -each.probability))
+        return tuple(sorted(together.values(), key=lambda each: -each.probability))
     return rivals if len(rivals) > 1 else cases
 
 

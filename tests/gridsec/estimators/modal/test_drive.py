@@ -7,10 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks._residuals import Dense, Source
 from gridsec.arrays import Floats
-from gridsec.estimators.modal import doubts
+from gridsec.estimators.modal import core, doubts, drive
+from gridsec.estimators.modal.filter import Interval
 from gridsec.estimators.modal.monitor import ModalDesign, ModalState, design, init, step
 from gridsec.interface import Decision, Frame, Verdict
+from tests.gridsec.estimators.modal.test_core import MODEL
 from tests.gridsec.estimators.sequential.test_monitor import prepare
 from tests.gridsec.street import Street, make_plant
 
@@ -41,6 +44,27 @@ def shifted(frame: Frame, meters: tuple[int, ...], by: float) -> Frame:
     y = frame.y.copy()
     y[list(meters)] += by
     return replace(frame, y=y)
+
+
+@pytest.mark.parametrize("h", [1.0, 30.0, 900.0])
+@pytest.mark.parametrize("silent", [False, True])
+def test_innovations_are_those_of_the_dense_filter(silent: bool, h: float) -> None:
+    """With complete and with missing readings before, at short and at long intervals."""
+    kernel = core.assemble(MODEL, np.zeros((13, 12)), np.full(12, 0.1), gamma=1e6)
+    dense, source = Dense(MODEL), Source(MODEL, np.random.default_rng(4))
+    state, seen = core.init(kernel, 0.0), np.ones(12, dtype=np.bool_)
+    for k in range(30):
+        m = source.tick()
+        seen[3] = not (silent and k % 7 == 2)
+        dense.step(1.0 if k else 0.0, m, seen)
+        state, _ = core.step(kernel, state, float(k), m, None if seen.all() else seen)
+    assert (state.filter.full is not None) == silent
+    m = source.tick()
+    found = drive.innovations(kernel, state, m, Interval(h))
+    std = drive.innovation_std(kernel, state, Interval(h))
+    nu, V = dense.step(h, m)
+    assert np.allclose(found, nu, atol=1e-9)
+    assert np.allclose(std, np.sqrt(V.diagonal()), rtol=1e-7)
 
 
 @pytest.mark.parametrize("lies", [(4,), (4, 7, 9)], ids=["one", "a quarter"])

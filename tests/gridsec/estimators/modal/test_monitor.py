@@ -110,4 +110,10 @@ def test_explanations_of_voltages_and_of_reported_powers_multiply() -> None:
     assert told[3].inverters[0]
     twice = combined((way(1, -1, -1, 0.6), way(1, 0, -1, 0.4)), (way(-1, 0, -1, 1.0),), mask(0, size=3))
     assert [each.probability for each in twice] == [1.0]
+    assert twice[0].meters.tolist() == mask(1).tolist()
+    assert twice[0].inverters.tolist() == mask(0, size=3).tolist()
+    (alone,) = combined((way(1, -1, -1, 1.0),), (way(-1, 0, -1, 0.9),), mask(2, size=3))
+    assert alone.meters[1]
+    assert alone.inverters.tolist() == mask(0, 2, size=3).tolist()
+    assert combined((), cases, mask(1, size=3)) is cases
     assert combined(rivals, (), mask(size=3)) is rivals

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -43,6 +45,30 @@ def test_scores_and_means_equal_those_of_the_dense_filter(make: object, kind: st
     assert np.allclose(moved, merged, atol=1e-6 * np.abs(merged).max())
     joint = found.joint(made)
     assert np.allclose(made.U @ joint.score, found.score)
+
+
+@pytest.mark.parametrize("rows", [(0,), (1,), (2,), (1, 0), (2, 1, 0)])
+def test_scores_from_the_latest_kept_state_are_those_from_the_first(rows: tuple[int, ...]) -> None:
+    """Onsets 70, 20 and 9 ticks old of 90: each replay begins at a kept state, or at the start."""
+    kernel, ticks, ages = core.assemble(MODEL, np.zeros((13, 12)), np.ones(12), gamma=1e6), 90, (9, 20, 70)
+    made, seen = kernel.modes, masks("random", 12, 90)
+    readings = Source(MODEL, np.random.default_rng(5)).ticks(ticks)
+    state, onsets = core.init(kernel, 0.0), signatures.empty(made, 3)
+    for k in range(ticks):
+        state, _ = core.step(kernel, state, float(k), readings[k], seen[k])
+        assert state.update is not None
+        begun = [row for row, age in enumerate(ages) if k == ticks - age]
+        onsets = signatures.follow(made, onsets, state.update, state.static, 1.0, begun=begun)
+    history = state.history
+    first = ticks - max(ages[row] for row in rows)
+    assert len(history.until(first)[0].readings) == {81: 80, 70: 64, 20: 0}[first]
+    found = replay.replayed(made, history, onsets, rows)
+    whole = replace(history, middle=None, recent=())
+    for one, other in zip(found, replay.replayed(made, whole, onsets, rows), strict=True):
+        assert one.row == other.row
+        for name in ("score", "information", "shift"):
+            expected = getattr(other, name)
+            assert np.allclose(getattr(one, name), expected, atol=1e-9 * np.abs(expected).max())
 
 
 @pytest.mark.canary("late")
