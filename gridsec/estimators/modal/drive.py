@@ -26,8 +26,7 @@ from math import sqrt
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, any_of, changed
-from gridsec.estimators.modal import doubts
-from gridsec.estimators.modal import filter as modal
+from gridsec.estimators.modal import doubts, verdict
 from gridsec.estimators.modal.core import Core, CoreState
 from gridsec.estimators.modal.filter import Interval
 from gridsec.estimators.sequential.design import SequentialDesign
@@ -81,8 +80,11 @@ def driven(  # noqa: PLR0917  # the state, and one frame
     predicted = predict(front, given, measured, uncertainty.sizes)
     if state.update is None or not front.meter_of.size or given.x is None:
         return given, measured, predicted
-    gap = Interval(measured.frame.t - given.t)
-    nu = innovations(core, state, measured.y - expected(predicted.v2_bus[front.prior.meters], own), gap)
+    m, gap = (
+        measured.y - expected(predicted.v2_bus[front.prior.meters], own),
+        Interval(measured.frame.t - given.t),
+    )
+    nu = verdict.offsets(core, state, m, gap)
     # The variance is at least that of the white errors.
     far = np.abs(nu) > JUMP * core.modes.noise_std
     if not any_of(far):
@@ -92,7 +94,7 @@ def driven(  # noqa: PLR0917  # the state, and one frame
     drives &= measured.available & given.trust.trusted
     if not any_of(drives & far):
         return given, measured, predicted
-    std = innovation_std(core, state, gap)
+    nu, std = verdict.deviations(core, state, m, gap)
     free = front.inverters_of(~given.trust.trusted)
     open_ = doubts.unknown(front, measured, uncertainty, before.error, free, given.clock_skew)
     if open_ is not None:
@@ -105,55 +107,6 @@ def driven(  # noqa: PLR0917  # the state, and one frame
     given = changed(given, trust=replace(given.trust, trusted=trusted))
     measured = measurements(front, measured.frame, trusted, given.busbar.trusted, given.v0_squared)
     return given, measured, predict(front, given, measured, uncertainty.sizes)
-
-
-def innovations(core: Core, state: CoreState, m: Floats, gap: Interval) -> Floats:
-    """Residuals (p,) of the next tick less their expectation, (p,), squared pu.
-
-    Parameters
-    ----------
-    core, state
-        The core, and its state after the last tick.
-    m : (p,)
-        The residuals.
-    gap
-        The interval between both ticks.
-    """
-    made, full, (rho, rho_b) = core.modes, state.filter.full, gap.decay(core.modes)
-    if full is not None:
-        return np.asarray(m - rho * full.mean[0] - rho_b * full.mean[1])
-    w, b = state.filter.mean
-    mean = rho * w + rho_b * b
-    if made.sign.size:
-        mean += _felt(state, rho, rho_b) * state.static.constant
-    return np.asarray(m - made.back @ mean)
-
-
-def innovation_std(core: Core, state: CoreState, gap: Interval) -> Floats:
-    """Standard deviations of `innovations`, (p,), squared pu.
-
-    Parameters
-    ----------
-    core, state, gap
-        As in `innovations`.
-    """
-    made, full, (rho, rho_b) = core.modes, state.filter.full, gap.decay(core.modes)
-    if full is not None:
-        w, both, b = (each.diagonal() for each in full.blocks)
-        variance = rho * rho * w + 2.0 * rho * rho_b * both + rho_b * rho_b * b + made.noise.diagonal()
-        variance += (1.0 - rho * rho) * made.covariance_w.diagonal()
-        return np.asarray(np.sqrt(variance + (1.0 - rho_b * rho_b) * made.covariance_b.diagonal()))
-    variance = (made.back * made.back) @ modal.predicted(made, state.filter.cov, rho, rho_b)[2]
-    if made.sign.size:
-        spread = made.back @ (_felt(state, rho, rho_b)[:, None] * made.directions)
-        variance += np.einsum("jr,rs,js->j", spread, state.static.cov, spread)
-    return np.asarray(np.sqrt(variance))
-
-
-def _felt(state: CoreState, rho: float, rho_b: float) -> Floats:
-    """Part of the constant amounts that the filter has not learned, (t,)."""
-    g_w, g_b = state.static.signature
-    return np.asarray(1.0 - rho * g_w - rho_b * g_b)
 
 
 def followed(  # noqa: PLR0917  # the state, and one frame

@@ -73,7 +73,7 @@ class Full:
     kept : (3, t)
         As ``cov`` of `FilterState`, of the readings that were there, with its diagonal kept at every tick.
     complete
-        Ticks with all readings since the last one without, or since the last attempt to return.
+        Ticks with all readings since the last one without.
     share : (t,) or None
         Part of each mode's information that was read; None where all readings are there.
     since

@@ -208,15 +208,13 @@ def in_common(problem: SearchProblem, laterals: Floats, best: Bools) -> Bools:
         The best set with independent amounts.
     """
     p, out = problem.meters, dict[bytes, Bools]()
-    some, starts = np.zeros((0, p), dtype=np.bool_), best[None, :p] & informed(problem)
+    some = np.zeros((0, p), dtype=np.bool_)
+    starts = (best[None, :p] & informed(problem))[: int(best[:p].any())]
     if len(laterals):
         a, b = laterals @ problem.y[:p], ((laterals @ problem.F[:p, :p]) * laterals).sum(axis=1)
         first = a * a / (np.maximum(b, 0.0) + problem.std[0] ** -2.0)
         some = laterals[np.argsort(-first, kind="stable")[:_COMMON]] > 0.0
-    if not best[:p].any():
-        starts = starts[:0]
-    none = np.zeros_like(starts)
-    end = Common(problem, np.vstack([none, some]), np.vstack([starts, some])).descend()
+    end = Common(problem, np.vstack([np.zeros_like(starts), some]), np.vstack([starts, some])).descend()
     near = end.toggled() < (end.cost - 2.0 * log(BELIEVED))[:, None]
     for inside, others in zip(end.inside, near, strict=True):
         for j in (-1, *np.flatnonzero(others)):

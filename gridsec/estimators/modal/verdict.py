@@ -28,9 +28,11 @@ from scipy.linalg import lapack
 from gridsec.arrays import PENDING, Bools, Floats, all_of, any_of, deferred, indices
 from gridsec.estimators.detection import DecisionInputs, decide
 from gridsec.estimators.modal import detector, masking, signatures
+from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.costs import amounts
 from gridsec.estimators.modal.detector import SIZE, WEIGHTS, Evidence
+from gridsec.estimators.modal.filter import Interval
 from gridsec.estimators.modal.search import DOUBT
 from gridsec.estimators.modal.signatures import Onsets
 from gridsec.estimators.modal.static import Static
@@ -175,8 +177,14 @@ class Answer(Verdict):
         return threshold
 
 
-def deviations(core: Core, state: CoreState, m: Floats) -> tuple[Floats, Floats]:
+NOW = Interval(0.0)
+"""No time between the last tick and the readings."""
+
+
+def deviations(core: Core, state: CoreState, m: Floats, gap: Interval = NOW) -> tuple[Floats, Floats]:
     """Deviation of every reading from the filter, and its standard deviation for a meter that is not read.
+
+    With the interval to the next tick they are the innovations of that.
 
     Parameters
     ----------
@@ -184,40 +192,44 @@ def deviations(core: Core, state: CoreState, m: Floats) -> tuple[Floats, Floats]
         The core, and the state after a tick.
     m : (p,)
         Residuals.
+    gap
+        Interval from that tick to the readings.
     """
-    full, made = state.filter.full, core.modes
+    full, made, (rho, rho_b) = state.filter.full, core.modes, gap.decay(core.modes)
     if full is None:
-        spread, P = _spread(core, state), state.filter.cov
-        variance = (made.back * made.back) @ (P[0] + 2.0 * P[1] + P[2] + 1.0)
+        variance = (made.back * made.back) @ modal.predicted(made, state.filter.cov, rho, rho_b)[2]
+        spread = made.back @ (_unlearned(state, rho, rho_b)[:, None] * made.directions)
         variance += np.einsum("jr,rs,js->j", spread, state.static.cov, spread)
     else:
-        variance = full.variance + made.noise.diagonal()
-    return offsets(core, state, m), np.sqrt(variance)
+        w, both, b = (each.diagonal() for each in full.blocks)
+        variance = rho * rho * w + 2.0 * rho * rho_b * both + rho_b * rho_b * b + made.noise.diagonal()
+        variance += (1.0 - rho * rho) * made.covariance_w.diagonal()
+        variance += (1.0 - rho_b * rho_b) * made.covariance_b.diagonal()
+    return offsets(core, state, m, gap), np.sqrt(variance)
 
 
-def offsets(core: Core, state: CoreState, m: Floats) -> Floats:
+def offsets(core: Core, state: CoreState, m: Floats, gap: Interval = NOW) -> Floats:
     """Deviation of every reading from the filter, (p,).
 
     Parameters
     ----------
-    core, state, m
+    core, state, m, gap
         As in `deviations`.
     """
-    full, made = state.filter.full, core.modes
+    full, made, (rho, rho_b) = state.filter.full, core.modes, gap.decay(core.modes)
     if full is not None:
-        return np.asarray(m - full.mean[0] - full.mean[1])
+        return np.asarray(m - rho * full.mean[0] - rho_b * full.mean[1])
     w, b = state.filter.mean
-    mean = w + b
+    mean = rho * w + rho_b * b
     if made.sign.size:
-        g_w, g_b = state.static.signature
-        mean += (1.0 - g_w - g_b) * state.static.constant
+        mean += _unlearned(state, rho, rho_b) * state.static.constant
     return np.asarray(m - made.back @ mean)
 
 
-def _spread(core: Core, state: CoreState) -> Floats:
-    """Change of the expected readings per amount of each direction, (p, r)."""
-    felt = 1.0 - state.static.signature[0] - state.static.signature[1]
-    return np.asarray(core.modes.back @ (felt[:, None] * core.modes.directions))
+def _unlearned(state: CoreState, rho: float, rho_b: float) -> Floats:
+    """Part of the constant amounts that the filter has not learned, (t,)."""
+    g_w, g_b = state.static.signature
+    return np.asarray(1.0 - rho * g_w - rho_b * g_b)
 
 
 def _row(state: CoreState, evidence: Evidence, suspicion: Suspicion | None) -> int:

@@ -9,9 +9,10 @@ import pytest
 
 from benchmarks._residuals import Dense, Source
 from gridsec.arrays import Floats
-from gridsec.estimators.modal import core, doubts, drive
+from gridsec.estimators.modal import core, doubts
 from gridsec.estimators.modal.filter import Interval
 from gridsec.estimators.modal.monitor import ModalDesign, ModalState, design, init, step
+from gridsec.estimators.modal.verdict import deviations
 from gridsec.interface import Decision, Frame, Verdict
 from tests.gridsec.estimators.modal.test_core import MODEL
 from tests.gridsec.estimators.sequential.test_monitor import prepare
@@ -60,8 +61,7 @@ def test_innovations_are_those_of_the_dense_filter(silent: bool, h: float) -> No
         state, _ = core.step(kernel, state, float(k), m, None if seen.all() else seen)
     assert (state.filter.full is not None) == silent
     m = source.tick()
-    found = drive.innovations(kernel, state, m, Interval(h))
-    std = drive.innovation_std(kernel, state, Interval(h))
+    found, std = deviations(kernel, state, m, Interval(h))
     nu, V = dense.step(h, m)
     assert np.allclose(found, nu, atol=1e-9)
     assert np.allclose(std, np.sqrt(V.diagonal()), rtol=1e-7)
