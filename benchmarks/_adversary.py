@@ -178,7 +178,7 @@ def core_region(kernel: Core, state: CoreState, age: int) -> AcceptanceRegion:
     age
         Ticks since the onset, its own included.
     """
-    modes, test = kernel.modes, state.detector
+    modes, test = kernel.modes, detector.followed(kernel.modes, state.detector)
     rows = np.flatnonzero(test.onsets.used & ~test.onsets.ramp)
     row = int(rows[np.argmin(np.abs(test.onsets.age[rows] - age))])
     joint, capital = signatures.joint(modes, test.onsets, state.static, row), test.capital[:, row]

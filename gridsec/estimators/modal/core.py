@@ -598,7 +598,7 @@ def _joint(core: Core, parts: Parts, row: int) -> Joint:
     for each in suspected:
         if each.row == row:
             return each.joint(core.modes)
-    return signatures.joint(core.modes, test.onsets, known, row)
+    return signatures.joint(core.modes, detector.followed(core.modes, test).onsets, known, row)
 
 
 def _searched(core: Core, state: CoreState, row: int, known: Bools | None) -> Identification:

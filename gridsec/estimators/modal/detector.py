@@ -39,7 +39,7 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import exp, inf, log, log1p, sqrt
 
 import numpy as np
@@ -99,6 +99,9 @@ class Detector:
         log M when it was evaluated last.
     precision
         Precision of the last innovation at each member; None before the first tick.
+    waiting
+        Ticks since the last evaluation, which onsets and capital do not contain yet: the rows pass the cache
+        once for all of them. None of them is waiting while an onset is pinned or a reading is missing.
     """
 
     onsets: Onsets
@@ -108,6 +111,16 @@ class Detector:
     pinned: Bools
     log_m: float
     precision: Precision | None = None
+    waiting: tuple[Tick, ...] = field(default=(), repr=False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tick:
+    """One step of the filter, the information about the directions with it, and the interval, s."""
+
+    update: Update
+    static: Static
+    h: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -229,34 +242,70 @@ def step(
     alert
         log M from which on it is evaluated at every tick.
     """
-    ticks, capital = before.ticks + 1, before.capital.copy()
-    ended = () if before.ratio is None else _thin(before, capital, before.ratio)
-    free = before.onsets.used
-    begun = [int(free[:_STEPS].argmin())]
-    capital[:, begun[0]] = log(1.0 - RAMPS)
-    if (ticks - 1) % RAMP_EVERY == 0:
-        begun.append(_STEPS + int(free[_STEPS:].argmin()))
-        capital[:, begun[1]] = log(RAMPS * RAMP_EVERY)
-    onsets = signatures.follow(modes, before.onsets, update, static, h, begun=begun, ended=ended)
+    ticks, waiting = before.ticks + 1, (*before.waiting, Tick(update, static, h))
     full, suspected = ticks <= EVERY or ticks % EVERY == 0, any_of(before.pinned)
     # The variances fall: an old bound is too low to be of use.
     least = precision(modes, None if full else before.precision, update)
     always = full or suspected or update.seen is not None or before.log_m >= alert
-    if not (always or _stands_out(modes, update, static, least)):
-        return Detector(onsets, capital, ticks, None, before.pinned, before.log_m, least), _NO_EVIDENCE
+    due = always or _stands_out(modes, update, static, least)
+    before = replace(before, ticks=ticks, precision=least, waiting=waiting)
+    if not due and update.exact is None:
+        return before, _NO_EVIDENCE
+    now = followed(modes, before)
+    return (evaluated(modes, columns, now, static, full=full) if due else (now, _NO_EVIDENCE))
+
+
+def followed(modes: Modes, before: Detector) -> Detector:
+    """The same with the ticks that are waiting; O(k t) each.
+
+    Parameters
+    ----------
+    modes, before
+        The modes, and the detector after a tick.
+    """
+    onsets, capital, ratio, ticks = before.onsets, before.capital, before.ratio, before.ticks
+    if not before.waiting:
+        return before
+    capital = capital.copy()
+    for number, tick in enumerate(before.waiting, ticks - len(before.waiting)):
+        ended = () if ratio is None else _thin(onsets, before.pinned, capital, ratio)
+        free, ratio = onsets.used, None
+        begun = [int(free[:_STEPS].argmin())]
+        capital[:, begun[0]] = log(1.0 - RAMPS)
+        if number % RAMP_EVERY == 0:
+            begun.append(_STEPS + int(free[_STEPS:].argmin()))
+            capital[:, begun[1]] = log(RAMPS * RAMP_EVERY)
+        onsets = signatures.follow(
+            modes, onsets, tick.update, tick.static, tick.h, begun=begun, ended=ended
+        )
+    return replace(before, onsets=onsets, capital=capital, ratio=None, waiting=())
+
+
+def evaluated(
+    modes: Modes, columns: Columns, test: Detector, static: Static, *, full: bool
+) -> tuple[Detector, Evidence]:
+    """M of all onsets, or of the young and the pinned ones.
+
+    Parameters
+    ----------
+    modes, columns, test, static
+        As in `step`; no tick is waiting.
+    full
+        All onsets.
+    """
+    onsets, capital = test.onsets, test.capital
     young = (onsets.age <= YOUNG) & ~onsets.ramp
-    due = onsets.used if full else onsets.used & (young | before.pinned)
+    due = onsets.used if full else onsets.used & (young | test.pinned)
     rows, ratio = indices(due), np.full(capital.shape, -inf)
     now = signatures.scores(modes, onsets, static, rows)
-    ratio[:, rows] = log_ratios(columns, modes, now, full or suspected)
+    ratio[:, rows] = log_ratios(columns, modes, now, full or any_of(test.pinned))
     by_row = capital + _LOG_WEIGHTS + ratio
     if any_of(due[_STEPS:]):
         # A ramp has its capital at the last tick of those that it stands for.
         by_row[:, onsets.ramp & (onsets.age < RAMP_EVERY)] = -inf
     top = float(by_row.max())
     log_m = top + log(float(np.exp(by_row - top).sum()))
-    test = Detector(onsets, capital, ticks, ratio if full else None, before.pinned, log_m, least)
-    return test, Evidence(log_m, by_row)
+    return replace(test, ratio=ratio if full else None, log_m=log_m), Evidence(log_m, by_row)
 
 
 def _stands_out(modes: Modes, update: Update, static: Static, least: Precision) -> bool:
@@ -292,17 +341,16 @@ def log_ratios(columns: Columns, modes: Modes, now: Scores, powers: bool) -> Flo
         Evaluate the powers as well; else they count as 0.
     """
     t, out = columns.members, np.full((3, len(now.score)), -inf)
-    W, squares, variance = columns.W, columns.squares, columns.variance
-    if not powers:
-        W, squares, variance = columns.without_powers
-    y, F = now.of(W, squares)
-    if now.busbar is not None:
-        F[:, F.shape[1] - now.busbar.shape[1] :] = now.busbar
-    each = log_lambda(y, F, variance)
-    out[0] = _log_mean(each[:, :t])
+    out[0] = _log_mean(log_lambda(*now.of_members(modes), columns.variance[:t]))
     out[1] = omnibus(now, SIZE**2 / modes.white)
-    if W.shape[1] > t:
-        out[2] = _log_mean(each[:, t:]) + log((W.shape[1] - t) / (columns.std.size - t))
+    (W, squares), q = columns.others, columns.std.size - t
+    # Without the powers, the phases of the busbar alone: the last columns.
+    first = 0 if powers else columns.powers
+    if q > first:
+        y, F = now.of(W[:, first:], squares[:, first:])
+        if now.busbar is not None:
+            F[:, F.shape[1] - now.busbar.shape[1] :] = now.busbar
+        out[2] = _log_mean(log_lambda(y, F, columns.variance[t + first :])) + log((q - first) / q)
     return out
 
 
@@ -373,11 +421,11 @@ def omnibus(now: Scores, s2: float) -> Floats:
     return np.asarray(0.5 * (out + np.einsum("kr,kr->k", pull, gain) - np.linalg.slogdet(rest)[1]))
 
 
-def _thin(detector: Detector, capital: Floats, ratio: Floats) -> list[int]:
+def _thin(onsets: Onsets, pinned: Bools, capital: Floats, ratio: Floats) -> list[int]:
     """Rows to drop, so that those of the next ticks are free; `capital` is changed: it goes to neighbours."""
-    onsets, gone = detector.onsets, list[int]()
+    gone = list[int]()
     age, kinds = onsets.age.tolist(), list(zip(capital.tolist(), ratio.tolist(), strict=True))
-    usable = onsets.used & ~detector.pinned
+    usable = onsets.used & ~pinned
     for rows, most in ((usable & ~onsets.ramp, STEP_ROWS), (usable & onsets.ramp, RAMP_ROWS)):
         order = sorted(indices(rows).tolist(), key=lambda row: -age[row])
         ages = [age[row] for row in order]

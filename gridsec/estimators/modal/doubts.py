@@ -203,7 +203,10 @@ def jump(
         level = np.where(read, level, np.nan if before is None else before.level)
     if before is None:
         return 0.0, Movements(level, np.zeros((2, 2 * N)), metered)
-    change = np.nan_to_num(level - before.level, copy=False)
+    change = level - before.level
+    missing = np.isnan(change)
+    if any_of(missing):
+        change[missing] = 0.0
     if any_of(metered) or any_of(before.metered):
         change[N:][metered != before.metered] = 0.0
     old = exp(-h / RISE_S) * before.moved

@@ -2,6 +2,7 @@
 
     driven(...) -> (SequentialState, Measurements, Prediction)  no inverter follows a reading that jumps
     followed(...) -> InjectionError                             every tick
+    fitted(...) -> Fit                                          every tick
 
 A manipulated reading that drives an inverter of the model moves the residuals of all others. An inverter
 with a distrusted meter follows the last estimate, moved by the model. The error of its input has the
@@ -20,13 +21,13 @@ injection is unknown then, and stays so for some time constants of the inverter.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import sqrt
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, any_of, changed
-from gridsec.estimators.modal import doubts, verdict
+from gridsec.estimators.modal import classes, doubts, verdict
 from gridsec.estimators.modal.core import Core, CoreState
 from gridsec.estimators.modal.filter import Interval
 from gridsec.estimators.sequential.design import SequentialDesign
@@ -36,6 +37,56 @@ from gridsec.estimators.sequential.step import injection_target, predict, relaxe
 
 JUMP = 6.0
 """Standard deviations of an innovation beyond which a reading does not drive an inverter, 1."""
+NEAR = 4.5
+"""White deviations from the last tick's fit from which on innovations are computed, 1: `JUMP` less a margin.
+
+The margin is for the flicker of the busbar's meter and the decay of the loads' errors.
+"""
+SHORT = 0.99
+"""Least decay of the loads' errors in an interval over which the fit of the last tick counts, 1."""
+LEARNING, RENEWED = 64, 16
+"""First ticks at which the own errors are computed, and later the ticks from one to the next.
+
+They enter the residuals times ``v2 - 1``: 16 ticks change a residual by less than a hundredth of its noise.
+"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """Readings by the filter after a tick. p meters.
+
+    Attributes
+    ----------
+    own : (p,)
+        Own errors of the meters at 1 pu, squared pu; with complete readings of up to `RENEWED` ticks before.
+    residuals : (p,) or None
+        Residuals by the filter, squared pu; None where readings are missing or meters suspected.
+    """
+
+    own: Floats
+    residuals: Floats | None = None
+
+
+def fitted(
+    core: Core, state: CoreState, before: Fit | None = None, ticks: int = 0, mean: Floats | None = None
+) -> Fit:
+    """Readings by the filter after a tick, O(p) at most ticks, O(p^2) at the others.
+
+    Parameters
+    ----------
+    core, state
+        The core, and its state after the tick.
+    before, ticks
+        The same after the tick before, and the number of ticks so far; None and 0 before the first.
+    mean : (p,)
+        Errors of the model at the meters, squared pu; None where a fault is suspected.
+    """
+    plain = before is not None and mean is not None and state.filter.full is None
+    if before is not None and plain and ticks > LEARNING and ticks % RENEWED:
+        own = before.own
+    else:
+        own = classes.means(core.classes, core.modes, state.filter, state.static)
+    return Fit(own, mean + own if plain and mean is not None else None)
 
 
 def expected(v2: Floats, own: Floats) -> Floats:
@@ -57,7 +108,7 @@ def driven(  # noqa: PLR0917  # the state, and one frame
     measured: Measurements,
     uncertainty: FrameUncertainty,
     before: InjectionError,
-    own: Floats,
+    fit: Fit,
 ) -> tuple[SequentialState, Measurements, Prediction]:
     """Front end, measurements and prediction without inverters driven by a reading that jumps.
 
@@ -74,22 +125,24 @@ def driven(  # noqa: PLR0917  # the state, and one frame
         The measurements of the frame, and its uncertainty beyond that of the design.
     before
         Errors of the injections before the tick.
-    own : (p,)
-        Own errors of the meters.
+    fit
+        Readings by the filter after the last tick.
     """
     predicted = predict(front, given, measured, uncertainty.sizes)
     if state.update is None or not front.meter_of.size or given.x is None:
         return given, measured, predicted
     m, gap = (
-        measured.y - expected(predicted.v2_bus[front.prior.meters], own),
+        measured.y - expected(predicted.v2_bus[front.prior.meters], fit.own),
         Interval(measured.frame.t - given.t),
     )
-    nu = verdict.offsets(core, state, m, gap)
     # The variance is at least that of the white errors.
-    far = np.abs(nu) > JUMP * core.modes.noise_std
+    if fit.residuals is not None and gap.decay(core.modes)[0] > SHORT:
+        far = np.abs(m - fit.residuals) > NEAR * core.modes.noise_std
+    else:
+        far = np.abs(verdict.offsets(core, state, m, gap)) > JUMP * core.modes.noise_std
     if not any_of(far):
         return given, measured, predicted
-    drives = np.zeros(nu.size, dtype=np.bool_)
+    drives = np.zeros(m.size, dtype=np.bool_)
     drives[front.meter_of[front.meter_of >= 0]] = True
     drives &= measured.available & given.trust.trusted
     if not any_of(drives & far):

@@ -35,6 +35,7 @@ from gridsec.estimators.modal import classes, core, doubts, drive, full, masking
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.doubts import Movements, Unknown
+from gridsec.estimators.modal.drive import Fit
 from gridsec.estimators.modal.estimate import Reconstructed, Spread
 from gridsec.estimators.modal.record import Record
 from gridsec.estimators.modal.replay import Reading
@@ -193,6 +194,8 @@ class ModalState:
         Ticks for which a reading that jumped, and drove no inverter, leaves the verdict open.
     injections
         Errors of the observed injections, as `drive` has them.
+    fit
+        Readings by the filter after the last tick.
     movements
         Movements of the powers up to the last frame; None before the first.
     """
@@ -207,6 +210,7 @@ class ModalState:
     kept: Record | None
     held: Ints
     injections: InjectionError
+    fit: Fit
     movements: Movements | None = None
 
     @property
@@ -237,7 +241,8 @@ def init(design: ModalDesign, t: float, commission: Commission | None = None) ->
     p = kernel.modes.size
     counts = np.zeros(phases.std.size - p - phases.powers, dtype=np.intp)
     none, inverters = np.zeros(p, dtype=np.intp), np.zeros(design.plant.droop.tau.size, dtype=np.intp)
-    return ModalState(front, begun, None, none, counts, inverters, 0, before, none, front.injection_error)
+    injections, fit = front.injection_error, drive.fitted(kernel, begun)
+    return ModalState(front, begun, None, none, counts, inverters, 0, before, none, injections, fit)
 
 
 def _begun(kernel: Core, before: Record | None, t: float) -> CoreState:
@@ -268,9 +273,9 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     uncertainty = update_uncertainty(
         front, given.uncertainty, frame, measured.available, measured.busbar_metered
     )
-    own, trusted = own_errors(design, state.core), given.trust.trusted
+    trusted = given.trust.trusted
     given, measured, predicted = drive.driven(
-        front, design.core, state.core, given, measured, uncertainty, state.injections, own
+        front, design.core, state.core, given, measured, uncertainty, state.injections, state.fit
     )
     h, free = frame.t - given.t, front.inverters_of(~given.trust.trusted)
     injections = drive.followed(front, state.injections, given, predicted, free, h)
@@ -294,7 +299,8 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     )
     open_ = doubts.unknown(front, measured, uncertainty, injections.error, free, skew)
     jump, movements = doubts.jump(front, design.reach, state.movements, measured, h)
-    seen, whole, m = measured.available, all_of(measured.available), measured.y - drive.expected(v2, own)
+    seen, whole = measured.available, all_of(measured.available)
+    m = measured.y - drive.expected(v2, state.fit.own)
     if not whole:
         m = np.where(seen, m, 0.0)
     kernel = _begun_anew(design, state, frame.t) if open_ is None and whole else state.core
@@ -543,8 +549,16 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         learning=learning,
         last=(estimate, answer),
     )
+    mean = None
+    if state.suspicion is None:
+        mean = (estimate.v2_bus - tick.predicted.v2_bus)[front.prior.meters]
     out = changed(
-        state, front=after, kept=kept or state.kept, held=tick.held, injections=tick.injections.reset(fed)
+        state,
+        front=after,
+        kept=kept or state.kept,
+        held=tick.held,
+        injections=tick.injections.reset(fed),
+        fit=drive.fitted(design.core, kernel, state.fit, now.ticks, mean),
     )
     return (out if learning is None else _learned(design, out)), estimate, answer
 
@@ -820,6 +834,7 @@ def renew(design: ModalDesign, state: ModalState, which: Bools) -> ModalState:
         due=0,
         kept=record.made(modes, opened, kernel.static),
         held=np.where(which, 0, state.held),
+        fit=drive.fitted(design.core, begun),
     )
 
 

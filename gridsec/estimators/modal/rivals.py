@@ -33,9 +33,9 @@ import numpy as np
 from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, all_of, indices, submatrix
+from gridsec.estimators.modal import detector, replay, signatures
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal import full as exact
-from gridsec.estimators.modal import replay, signatures
 from gridsec.estimators.modal.filter import FilterState, Interval, Update
 from gridsec.estimators.modal.model import REPORTED_S, Modes
 from gridsec.estimators.modal.replay import History, Suspected
@@ -166,7 +166,7 @@ def replayed(
         The onsets of the detector after the last reading, and the row of the onset.
     """
     state, _, test, suspected = history.start
-    count, age, had = len(history.readings), int(onsets.age[row]), test.onsets
+    count, age, had = len(history.readings), int(onsets.age[row]), detector.followed(modes, test).onsets
     older = bool(had.used[row]) and int(had.age[row]) == age - count
     exactly = next((each for each in suspected if older and each.row == row), None)
     begin = max(0, count - age)

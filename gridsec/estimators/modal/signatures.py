@@ -255,7 +255,7 @@ class Scores:
     cov : (r, r)
         Their N.
     share : (k, t) or None
-        Share of the information that was read at each member; None for 1.
+        Share of the members' information that was read at each; None for 1.
     busbar : (k, b) or None
         Exact information about the phases of the busbar; None where ``information`` is exact.
     """
@@ -273,7 +273,7 @@ class Scores:
         Parameters
         ----------
         W, squares : (t, q)
-            The columns in the modes, those of the members first, and their squares.
+            The columns in the modes, and their squares.
         """
         (k, t), F = self.score.shape, self.information @ squares
         # One product in place of two: the columns are read once.
@@ -286,8 +286,13 @@ class Scores:
         elif self.cov.size:
             side = side.reshape(k, len(self.cov), -1)
             F -= np.einsum("krq,rs,ksq->kq", side, self.cov, side)
+        return y, F
+
+    def of_members(self, modes: Modes) -> tuple[Floats, Floats]:
+        """Scores and information of the members, (k, t) each; the share of the information that was read."""
+        y, F = self.of(modes.U.T, modes.squares.T)
         if self.share is not None:
-            F[:, : self.share.shape[1]] *= self.share
+            F *= self.share
         return y, F
 
 
@@ -388,20 +393,15 @@ class Columns:
     powers: int
 
     @cached_property
-    def squares(self) -> Floats:
-        """Squares of W, (t, q)."""
-        return np.asarray(self.W * self.W)
+    def others(self) -> tuple[Floats, Floats]:
+        """Columns of powers and busbar, (t, q - members), and their squares."""
+        W = self.W[:, self.members :].copy()
+        return W, W * W
 
     @cached_property
     def variance(self) -> Floats:
         """Squares of std, (q,)."""
         return np.asarray(self.std * self.std)
-
-    @cached_property
-    def without_powers(self) -> tuple[Floats, Floats, Floats]:
-        """W, squares and variance of the members and of the busbar."""
-        at = np.r_[: self.members, self.members + self.powers : self.std.size]
-        return self.W[:, at], self.squares[:, at], self.variance[at]
 
 
 def columns(modes: Modes, powers: Floats, power_std: Floats, std: float) -> Columns:

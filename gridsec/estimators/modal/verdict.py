@@ -31,7 +31,7 @@ from gridsec.estimators.modal import detector, masking, signatures
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.costs import amounts
-from gridsec.estimators.modal.detector import SIZE, WEIGHTS, Evidence
+from gridsec.estimators.modal.detector import SIZE, WEIGHTS, Evidence, Tick
 from gridsec.estimators.modal.filter import Interval
 from gridsec.estimators.modal.search import DOUBT
 from gridsec.estimators.modal.signatures import Onsets
@@ -112,7 +112,7 @@ def meter_evidence(  # noqa: PLR0917  # the core, one tick, and one limit
         masked = (state.masked.meters, *deviations(core, state, m))
         tested = tested | (state.masked.meters & seen)
     one, capital = signatures.single(test.onsets, row), float(test.capital[0, row])
-    return MeterEvidence(tested, _Amounts(core, one, state.static, capital, seen, masked))
+    return MeterEvidence(tested, _Amounts(core, one, test.waiting, state.static, capital, seen, masked))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,6 +121,7 @@ class _Amounts:
 
     core: Core
     one: Onsets  # the onset by itself
+    waiting: tuple[Tick, ...]  # ticks that it does not contain yet
     static: Static  # information about the directions
     capital: float  # its logarithm
     seen: Bools  # (p,) meters with a reading
@@ -128,9 +129,11 @@ class _Amounts:
     masked: tuple[Bools, Floats, Floats] | None
 
     def __call__(self) -> tuple[Floats, Floats]:
-        made = self.core.modes
-        now = signatures.scores(made, self.one, self.static)
-        y, F = (each[0] for each in now.of(made.U.T, made.squares.T))
+        made, one = self.core.modes, self.one
+        for tick in self.waiting:
+            one = signatures.follow(made, one, tick.update, tick.static, tick.h)
+        now = signatures.scores(made, one, self.static)
+        y, F = (each[0] for each in now.of_members(made))
         F = np.maximum(F, _TINY)
         part = log(WEIGHTS[0] / made.size) + self.capital
         gain = 2.0 * (self.core.limit - part) + np.log1p(SIZE**2 * F)
@@ -368,9 +371,9 @@ def share(  # noqa: PLR0917  # the core, and one report
     """
     inverter = int(np.argmax(design.meter_of == j))
     at = core.modes.size + design.customers + inverter
-    W, onsets = core.faults.W[:, [at]], state.detector.onsets
+    W, onsets = core.faults.W[:, [at]], detector.followed(core.modes, state.detector).onsets
     rows = np.flatnonzero(onsets.used & ~onsets.ramp)
-    now = replace(signatures.scores(core.modes, onsets, state.static, rows), share=None)
+    now = signatures.scores(core.modes, onsets, state.static, rows)
     y, F = now.of(W, W * W)
     update = state.update
     if update is not None and update.exact is not None:

@@ -77,7 +77,7 @@ def test_likelihood_ratios_equal_those_of_dense_filters(make: object, ramp: bool
     row = 1 if ramp else 0
     onsets, more = follow(made, readings, {row: onset}, signatures.empty(made, 1, 1))
     now, together = signatures.scores(made, onsets, more), signatures.joint(made, onsets, more, row)
-    y, F = now.of(of.W, of.squares)
+    y, F = now.of(of.W, of.W**2)
     found = detector.log_lambda(y, F, np.square(of.std))[row]
     if made.sign.size <= static.FEW:
         matrix = together.of(of.W)
@@ -123,7 +123,8 @@ def test_ratios_with_missing_readings_have_means_of_at_most_1(make: object, kind
     z, whole, single = [], [], []
     for _ in range(runs):
         _, now = played(made, Source(model, random).ticks(60), begins, signatures.empty(made, 6), seen)
-        y, F = now.of(of.W, of.squares)
+        members, others = now.of_members(made), now.of(*of.others)
+        y, F = (np.hstack(each) for each in zip(members, others, strict=True))
         z.append(y * y / np.maximum(F, 1e-3 * F.max(axis=1, keepdims=True)))
         # Small prior variances, for which Lambda has a finite variance.
         s2 = 0.3 / now.information.max(axis=1)
@@ -192,7 +193,7 @@ def test_dropping_onsets_leaves_m_and_covers_all_ages() -> None:
     assert test.ticks % detector.EVERY == 0
     assert test.ratio is not None
     capital, onsets = test.capital.copy(), test.onsets
-    gone = detector._thin(test, capital, test.ratio)
+    gone = detector._thin(onsets, test.pinned, capital, test.ratio)
     used = onsets.used & ~np.isin(np.arange(onsets.used.size), gone)
     now = signatures.scores(made, onsets, more)
     ratio = detector.log_ratios(of, made, now, powers=True)
