@@ -252,7 +252,7 @@ def step(
     if not due and update.exact is None:
         return before, _NO_EVIDENCE
     now = followed(modes, before)
-    return (evaluated(modes, columns, now, static, full=full) if due else (now, _NO_EVIDENCE))
+    return evaluated(modes, columns, now, static, full=full) if due else (now, _NO_EVIDENCE)
 
 
 def followed(modes: Modes, before: Detector) -> Detector:
@@ -275,9 +275,7 @@ def followed(modes: Modes, before: Detector) -> Detector:
         if number % RAMP_EVERY == 0:
             begun.append(_STEPS + int(free[_STEPS:].argmin()))
             capital[:, begun[1]] = log(RAMPS * RAMP_EVERY)
-        onsets = signatures.follow(
-            modes, onsets, tick.update, tick.static, tick.h, begun=begun, ended=ended
-        )
+        onsets = signatures.follow(modes, onsets, tick.update, tick.static, tick.h, begun=begun, ended=ended)
     return replace(before, onsets=onsets, capital=capital, ratio=None, waiting=())
 
 

@@ -198,9 +198,10 @@ def jump(
         # Unknown directions of every frame.
         level[np.tile(doubt.sudden_p > 0.0, 2)] = 0.0
     if frame.p_origin is not None:
-        # Powers that come back are compared with their last reading.
-        read = np.tile(frame.p_origin == PowerOrigin.READ, 2)
-        level = np.where(read, level, np.nan if before is None else before.level)
+        read = frame.p_origin == PowerOrigin.READ
+        if not all_of(read):
+            # Powers that come back are compared with their last reading.
+            level = np.where(np.tile(read, 2), level, np.nan if before is None else before.level)
     if before is None:
         return 0.0, Movements(level, np.zeros((2, 2 * N)), metered)
     change = level - before.level

@@ -115,7 +115,7 @@ def empty(modes: Modes, steps: int, ramps: int = 0) -> Onsets:
 
 
 def single(onsets: Onsets, row: int) -> Onsets:
-    """One row by itself, as a copy: it does not keep the others in memory.
+    """One row by itself, its sums as copies: it does not keep those of the others in memory.
 
     Parameters
     ----------
@@ -124,10 +124,10 @@ def single(onsets: Onsets, row: int) -> Onsets:
     """
     at, lost, busbar = slice(row, row + 1), onsets.lost, onsets.busbar
     return Onsets(
-        onsets.age[at].copy(),
-        onsets.used[at].copy(),
-        onsets.ramp[at].copy(),
-        onsets.level[at].copy(),
+        onsets.age[at],
+        onsets.used[at],
+        onsets.ramp[at],
+        onsets.level[at],
         onsets.signature[:, at].copy(),
         onsets.score[at].copy(),
         onsets.information[at].copy(),
