@@ -406,7 +406,8 @@ def _gap_delays(made: DesignedEstimator, kernel: Core, seen: Bools, seed: int) -
         mine, evidence = core.step(kernel, mine, frame.t, m, seen[k])
         level = cusum.step(float(k > 0), m, seen[k], k >= QUIET - 10)
         begun = slice(max(1, cusum.count))
-        each = detector.log_lambda(cusum.y[begun], cusum.F[begun], np.array(detector.SIZE**2))
+        own = cusum.y[begun, None], cusum.F[begun, None], np.array([detector.SIZE**2])
+        each = detector.log_mean(*own)
         weight = detector.WEIGHTS[0] * (1.0 - detector.RAMPS) / kernel.modes.size
         mixture = float(np.logaddexp.reduce(each)) + log(weight)
         there = [level >= kernel.limit, mixture >= kernel.limit, core.alarmed(kernel, evidence), False]

@@ -61,9 +61,11 @@ RAMPS = 0.1
 STEP_ROWS, RAMP_ROWS = 18, 6
 """Onsets of steps and of ramps that are kept. Ages grow by about 1.7 from row to row up to `OLDEST`."""
 EVERY = 4
-"""Ticks from one full evaluation to the next: powers and old onsets take most of the time and can wait."""
+"""Ticks from one evaluation of most onsets and of powers to the next: they take most of the time."""
 RAMP_EVERY = 4 * EVERY
 """Ticks from one onset of a ramp to the next: a ramp of fewer ticks is not told from a step."""
+OLD, RARELY = 64 * EVERY, 4 * EVERY
+"""Age from which on an onset is evaluated at every `RARELY`-th tick, ticks: later by a sixteenth of it."""
 YOUNG = 6 * EVERY
 """Largest age of onsets that are evaluated at every tick, ticks: `EVERY` is a sixth of it."""
 JUMP = 12.25
@@ -92,7 +94,8 @@ class Detector:
     ticks
         Ticks since the start.
     ratio : (3, k) or None
-        Log Lambda of each kind and row after a full evaluation; the next tick thins the onsets by it.
+        Log Lambda of each kind and row after a full evaluation, -inf where not evaluated; the next tick thins
+        the evaluated onsets by it.
     pinned : (k,)
         Rows that are evaluated at every tick and not dropped.
     log_m
@@ -223,11 +226,11 @@ def step(
 ) -> tuple[Detector, Evidence]:
     """Take in one step of the filter and evaluate M, if that is due.
 
-    All onsets are evaluated at the first `EVERY` ticks, and then at every `EVERY`-th. Young and pinned ones
-    are evaluated at every tick while an onset is pinned, while log M was above `alert`, where a reading is
-    missing, and where one innovation stands out by itself. Powers are evaluated with all onsets and while
-    one is pinned: an alarm by them alone lasts. The choice may depend on the readings: what is left out only
-    makes M smaller.
+    All onsets are evaluated at the first `EVERY` ticks, and then at every `EVERY`-th, those older than `OLD`
+    at every `RARELY`-th. Young and pinned ones are evaluated at every tick while an onset is pinned, while
+    log M was above `alert`, where a reading is missing, and where one innovation stands out by itself. Powers
+    are evaluated with the first two and while an onset is pinned: an alarm by them alone lasts. The choice
+    may depend on the readings: what is left out only makes M smaller.
 
     Parameters
     ----------
@@ -282,18 +285,20 @@ def followed(modes: Modes, before: Detector) -> Detector:
 def evaluated(
     modes: Modes, columns: Columns, test: Detector, static: Static, *, full: bool
 ) -> tuple[Detector, Evidence]:
-    """M of all onsets, or of the young and the pinned ones.
+    """M of most onsets, or of the young and the pinned ones.
 
     Parameters
     ----------
     modes, columns, test, static
         As in `step`; no tick is waiting.
     full
-        All onsets.
+        All onsets up to the age `OLD`, and all when the old ones are due.
     """
-    onsets, capital = test.onsets, test.capital
-    young = (onsets.age <= YOUNG) & ~onsets.ramp
-    due = onsets.used if full else onsets.used & (young | test.pinned)
+    onsets, capital, due = test.onsets, test.capital, test.onsets.used
+    if not full:
+        due = due & (((onsets.age <= YOUNG) & ~onsets.ramp) | test.pinned)
+    elif test.ticks > EVERY and test.ticks % RARELY:
+        due = due & ((onsets.age <= OLD) | test.pinned)
     rows, ratio = indices(due), np.full(capital.shape, -inf)
     now = signatures.scores(modes, onsets, static, rows)
     ratio[:, rows] = log_ratios(columns, modes, now, full or any_of(test.pinned))
@@ -339,7 +344,7 @@ def log_ratios(columns: Columns, modes: Modes, now: Scores, powers: bool) -> Flo
         Evaluate the powers as well; else they count as 0.
     """
     t, out = columns.members, np.full((3, len(now.score)), -inf)
-    out[0] = _log_mean(log_lambda(*now.of_members(modes), columns.variance[:t]))
+    out[0] = log_mean(*now.of_members(modes), columns.variance[:t])
     out[1] = omnibus(now, SIZE**2 / modes.white)
     (W, squares), q = columns.others, columns.std.size - t
     # Without the powers, the phases of the busbar alone: the last columns.
@@ -348,35 +353,30 @@ def log_ratios(columns: Columns, modes: Modes, now: Scores, powers: bool) -> Flo
         y, F = now.of(W[:, first:], squares[:, first:])
         if now.busbar is not None:
             F[:, F.shape[1] - now.busbar.shape[1] :] = now.busbar
-        out[2] = _log_mean(log_lambda(y, F, columns.variance[t + first :])) + log((q - first) / q)
+        out[2] = log_mean(y, F, columns.variance[t + first :]) + log((q - first) / q)
     return out
 
 
-def log_lambda(y: Floats, F: Floats, s2: Floats) -> Floats:
-    """Log Lambda of f ~ N(0, s2) in single columns, of the shape of y.
+def log_mean(y: Floats, F: Floats, s2: Floats) -> Floats:
+    """Logarithm of the mean Lambda of f ~ N(0, s2) in single columns, (k,).
 
     Parameters
     ----------
-    y, F
+    y, F : (k, q)
         Scores and information.
-    s2
+    s2 : (q,)
         Prior variances.
     """
     more = s2 * F
     more += 1.0
-    out = y * y
-    out *= s2
-    out /= more
-    out -= np.log(more, out=more)
-    out *= 0.5
-    return out
-
-
-def _log_mean(each: Floats) -> Floats:
-    """Logarithm of the mean over the last axis."""
-    top = each.max(axis=1)
-    ratio = each - top[:, None]
-    return np.asarray(top + np.log(np.exp(ratio, out=ratio).sum(axis=1) / each.shape[1]))
+    half = y * y
+    half *= 0.5 * s2
+    half /= more
+    top = half.max(axis=1)
+    half -= top[:, None]
+    np.exp(half, out=half)
+    half /= np.sqrt(more, out=more)
+    return np.asarray(top + np.log(half.sum(axis=1) / half.shape[1]))
 
 
 def omnibus(now: Scores, s2: float) -> Floats:
@@ -423,13 +423,14 @@ def _thin(onsets: Onsets, pinned: Bools, capital: Floats, ratio: Floats) -> list
     """Rows to drop, so that those of the next ticks are free; `capital` is changed: it goes to neighbours."""
     gone = list[int]()
     age, kinds = onsets.age.tolist(), list(zip(capital.tolist(), ratio.tolist(), strict=True))
-    usable = onsets.used & ~pinned
-    for rows, most in ((usable & ~onsets.ramp, STEP_ROWS), (usable & onsets.ramp, RAMP_ROWS)):
-        order = sorted(indices(rows).tolist(), key=lambda row: -age[row])
+    usable, known = onsets.used & ~pinned, ratio[0] > -inf
+    for kind, all_rows in ((usable & ~onsets.ramp, STEP_ROWS), (usable & onsets.ramp, RAMP_ROWS)):
+        most = all_rows - int(np.count_nonzero(kind & ~known))
+        order = sorted(indices(kind & known).tolist(), key=lambda row: -age[row])
         ages = [age[row] for row in order]
         # Ratio of the ages beside each onset but the first and the last.
         beside = [ages[k - 1] / ages[k + 1] for k in range(1, len(ages) - 1)]
-        while len(order) > most or (ages and ages[0] > OLDEST):
+        while (len(order) > most and beside) or (ages and ages[0] > OLDEST):
             at = 0 if ages[0] > OLDEST else 1 + beside.index(min(beside))
             row = order.pop(at)
             ages.pop(at)

@@ -78,7 +78,8 @@ def test_likelihood_ratios_equal_those_of_dense_filters(make: object, ramp: bool
     onsets, more = follow(made, readings, {row: onset}, signatures.empty(made, 1, 1))
     now, together = signatures.scores(made, onsets, more), signatures.joint(made, onsets, more, row)
     y, F = now.of(of.W, of.W**2)
-    found = detector.log_lambda(y, F, np.square(of.std))[row]
+    each = ((y[:, [q]], F[:, [q]], np.square(of.std[[q]])) for q in range(of.std.size))
+    found = np.array([detector.log_mean(*one)[row] for one in each])
     if made.sign.size <= static.FEW:
         matrix = together.of(of.W)
         assert np.allclose(matrix[0], y[row])
@@ -129,7 +130,7 @@ def test_ratios_with_missing_readings_have_means_of_at_most_1(make: object, kind
         # Small prior variances, for which Lambda has a finite variance.
         s2 = 0.3 / now.information.max(axis=1)
         whole.append(np.exp([detector.omnibus(now, each)[k] for k, each in enumerate(s2)]))
-        single.append(np.exp(detector.log_lambda(y, F, 0.3 / F.max(axis=1, keepdims=True))).mean(axis=1))
+        single.append(np.exp(detector.log_mean(y, F, 0.3 / F.max(axis=1, keepdims=True))))
     spread = np.mean(z, axis=0)
     # One of a thousand cases exceeds this in any entry by chance.
     assert (spread < chi2.ppf(1.0 - 1e-3 / spread.size, runs) / runs).all()
