@@ -278,7 +278,16 @@ def followed(modes: Modes, before: Detector) -> Detector:
         if number % RAMP_EVERY == 0:
             begun.append(_STEPS + int(free[_STEPS:].argmin()))
             capital[:, begun[1]] = log(RAMPS * RAMP_EVERY)
-        onsets = signatures.follow(modes, onsets, tick.update, tick.static, tick.h, begun=begun, ended=ended)
+        onsets = signatures.follow(
+            modes,
+            onsets,
+            tick.update,
+            tick.static,
+            tick.h,
+            begun=begun,
+            ended=ended,
+            own=onsets is not before.onsets,
+        )
     return replace(before, onsets=onsets, capital=capital, ratio=None, waiting=())
 
 

@@ -146,6 +146,7 @@ def follow(
     *,
     begun: Sequence[int] = (),
     ended: Sequence[int] = (),
+    own: bool = False,
 ) -> Onsets:
     """Take in one step of the filter; O(k t), and O(k t^2) where readings are missing.
 
@@ -161,6 +162,8 @@ def follow(
         Interval, s.
     begun, ended
         Rows, not in use so far, for onsets at this tick, and other rows that are given back.
+    own
+        Change the sums in place: nothing else uses those of `onsets`.
     """
     rho, rho_b = update.decay
     age, used, level = onsets.age, onsets.used, onsets.level
@@ -171,23 +174,22 @@ def follow(
         for row in ended:
             used[row], level[row], age[row] = False, 0.0, 0
     level = level + (h / RAMP_S) * (onsets.ramp & used)
-    g = np.empty_like(onsets.signature)
-    np.multiply(onsets.signature[0], rho, out=g[0])
-    np.multiply(onsets.signature[1], rho_b, out=g[1])
+    sums = onsets.signature, onsets.score, onsets.information, onsets.cross
+    g, score, information, cross = sums if own else (each.copy() for each in sums)
+    g[0] *= rho
+    g[1] *= rho_b
     gamma = level[:, None] - g[0]
     gamma -= g[1]
     lost, busbar = _lost(modes, onsets, update, gamma), _busbar(modes, onsets, update, static, gamma)
-    score = gamma * (static.score + static.gamma * static.constant / update.variance)
-    score += onsets.score
-    weighed = gamma / update.variance
-    cross = weighed * static.gamma
-    cross += onsets.cross
-    # Products take the place of arrays that are not needed any more: new ones do not stay in the cache.
-    information = np.multiply(weighed, gamma, out=weighed)
-    information += onsets.information
-    gain = update.gain if update.slower is None else update.slower
-    g[0] += gain[0] * gamma
-    g[1] += np.multiply(gain[1], gamma, out=gamma)
+    inverse, gain = 1.0 / update.variance, update.gain if update.slower is None else update.slower
+    # One array takes all products: new ones do not stay in the cache.
+    part = gamma * (static.score + static.gamma * static.constant * inverse)
+    score += part
+    cross += np.multiply(gamma, static.gamma * inverse, out=part)
+    g[0] += np.multiply(gamma, gain[0], out=part)
+    g[1] += np.multiply(gamma, gain[1], out=part)
+    gamma *= gamma
+    information += np.multiply(gamma, inverse, out=part)
     for row in ended:
         g[:, row] = score[row] = information[row] = cross[row] = 0.0
         if lost is not None:
