@@ -50,7 +50,7 @@ from gridsec.estimators.modal import signatures
 from gridsec.estimators.modal.filter import Update
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.signatures import Columns, Onsets, Scores
-from gridsec.estimators.modal.static import Static, squares
+from gridsec.estimators.modal.static import Static
 
 SIZE = 0.01
 """Prior standard deviation of a fault, squared pu: 0.5 % of the voltage, the class of ordinary meters."""
@@ -323,7 +323,7 @@ def evaluated(
 def _stands_out(modes: Modes, update: Update, static: Static, least: Precision) -> bool:
     """A member, a phase of the busbar, or all together, stand out in one innovation of all members."""
     v, exact = update.variance, update.exact
-    if squares(static, update) > v.size + sqrt(2.0 * JUMP * v.size):
+    if static.square > v.size + sqrt(2.0 * JUMP * v.size):
         return True
     if exact is not None:
         sigma = exact.score

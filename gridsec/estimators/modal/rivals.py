@@ -40,7 +40,7 @@ from gridsec.estimators.modal.filter import FilterState, Interval, Update
 from gridsec.estimators.modal.model import REPORTED_S, Modes
 from gridsec.estimators.modal.replay import History, Suspected
 from gridsec.estimators.modal.signatures import Joint, Onsets
-from gridsec.estimators.modal.static import Static, squares
+from gridsec.estimators.modal.static import Static
 
 UNREST = (1.0, 30.0)
 """Variances of the loads' changes of the rivals, in those of the model, 1."""
@@ -219,7 +219,6 @@ def follow(  # noqa: PLR0917  # the state, and one tick
         total, jumps = total + prior, jumps + (size > 0.0)
         state = _jumped(modes, state, gap, size)
     state, known, update = exact.step(modes, state, known, t, m, seen, stay=True, unknown=unknown, jump=jump)
-    square = squares(known, update)
     if update.exact is None:
         count = modes.size
         total -= 0.5 * float((update.innovation**2 / update.variance + np.log(update.variance)).sum())
@@ -227,7 +226,7 @@ def follow(  # noqa: PLR0917  # the state, and one tick
             onsets = signatures.follow(modes, onsets, update, known, gap.h, begun=[0] if begun else [])
     else:
         count = update.exact.white.size
-        total -= 0.5 * square + float(np.log(update.exact.half.diagonal()).sum())
+        total -= 0.5 * known.square + float(np.log(update.exact.half.diagonal()).sum())
         if begun:
             suspected = replay.begun(modes, 0, bool(onsets.ramp[0]))
         if suspected is not None:
@@ -242,7 +241,7 @@ def follow(  # noqa: PLR0917  # the state, and one tick
         suspected=suspected,
         jumps=jumps,
         unsteady=before.unsteady + (float(size > 0.0) - before.unsteady) / RECENT,
-        misfit=square - count + (0.0 if begun else before.misfit),
+        misfit=known.square - count + (0.0 if begun else before.misfit),
         count=count + (0 if begun else before.count),
         ticks=1 + (0 if begun else before.ticks),
         update=update,

@@ -63,6 +63,8 @@ class Static:
         ``V^-1`` times the exact innovation of the last tick, in the modes.
     constant : (t,)
         ``Gamma theta``.
+    square
+        Squares of the whitened innovation of the last tick, 1: their number is expected without a fault.
     """
 
     signature: Floats
@@ -73,6 +75,7 @@ class Static:
     cov: Floats = field(repr=False)
     score: Floats
     constant: Floats
+    square: float = 0.0
 
 
 def start(modes: Modes) -> Static:
@@ -100,9 +103,11 @@ def follow(modes: Modes, before: Static, update: Update) -> Static:
     update
         The filter's step.
     """
+    exact, nu = update.exact, update.innovation
+    square = 0.0 if exact is None else float(exact.white @ exact.white)
     if not modes.sign.size:
-        score = update.innovation / update.variance if update.score is None else update.score
-        return changed(before, score=score)
+        score = nu / update.variance if update.score is None else update.score
+        return changed(before, score=score, square=float(nu @ score) if exact is None else square)
     rho, rho_b = update.decay
     g = before.signature * np.array((rho, rho_b))[:, None]
     gamma = 1.0 - g[0] - g[1]
@@ -119,25 +124,15 @@ def follow(modes: Modes, before: Static, update: Update) -> Static:
             G = modes.directions[:, : modes.busbar]
             turn[: modes.busbar] = of_busbar(modes, now) @ ((gamma * update.score) @ G)
         theta = before.theta + turn
-        return Static(g, gamma, before.pull, information, theta, cov, update.score, modes.directions @ theta)
-    pull = before.pull + (relative * update.innovation) @ modes.directions
+        constant = modes.directions @ theta
+        return Static(g, gamma, before.pull, information, theta, cov, update.score, constant, square)
+    pull = before.pull + (relative * nu) @ modes.directions
     theta, cov = _learned(modes, before, information, pull)
-    score, constant = update.innovation / update.variance, modes.directions @ theta
+    score, constant = nu / update.variance, modes.directions @ theta
     score -= relative * constant
-    return Static(g, gamma, pull, information, theta, cov, score, constant)
-
-
-def squares(now: Static, update: Update) -> float:
-    """Squares of the whitened innovation of a tick: their number is expected without a fault.
-
-    Parameters
-    ----------
-    now, update
-        The information with this tick, and the filter's step.
-    """
-    if update.exact is not None:
-        return float(update.exact.white @ update.exact.white)
-    return float(now.score @ (update.variance * now.score))
+    # The exact innovation is that less the amounts before this tick.
+    square = float((nu - gamma * before.constant) @ score)
+    return Static(g, gamma, pull, information, theta, cov, score, constant, square)
 
 
 def _learned(modes: Modes, before: Static, information: Floats, pull: Floats) -> tuple[Floats, Floats]:

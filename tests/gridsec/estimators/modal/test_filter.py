@@ -77,6 +77,7 @@ def test_loads_that_jump_are_those_of_the_dense_filter(share: float) -> None:
             made, state, more, float(k), m, None if seen.all() else seen, jump=jump
         )
         nu, V = dense.step(float(k > 0), m, seen, jump=jump)
+        assert np.isclose(more.square, nu @ np.linalg.solve(V, nu), rtol=1e-7)
         if update.exact is not None:
             assert close(update.exact.half @ update.exact.white, nu)
             assert close(update.exact.half @ update.exact.half.T, V)
@@ -105,6 +106,7 @@ def test_directions_make_it_exact_for_every_b(make: object, fixed_s: float) -> N
         state, more, update = full.step(made, state, more, t, m)
         nu, V = dense.step(h, m)
         assert close(made.back @ (update.innovation - more.gamma * known), nu)
+        assert np.isclose(more.square, nu @ np.linalg.solve(V, nu), rtol=1e-7)
         if made.sign.size <= static.FEW:
             side = made.back @ (more.gamma[:, None] * made.directions)
             assert close((made.back * update.variance) @ made.back.T + side @ cov @ side.T, V)
