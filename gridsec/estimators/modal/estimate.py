@@ -54,28 +54,38 @@ class Estimator:
 
     Attributes
     ----------
-    of_w, of_b, of_e : (n, t)
-        Regression of the error of the model at each place on w, b and e.
     of_parts : (n, t + k)
         Covariance h of the loads at each place with the modes, and L.
     by_w : (t,)
-        ``of_w = h diag(by_w)``.
+        Regression of each mode's loads on w: that of the places is ``h diag(by_w)``.
     right : (k, 2 t)
-        R of ``(of_b, of_e) = L R``, of a few directions: the busbar's phases.
+        R of the regression ``L R`` of the places on (b, e), of a few directions: the busbar's phases.
     rest : (n,)
         Variance that no reading takes away, squared pu^2.
     rest_w : (n,)
         Part of it that varies with the loads, squared pu^2.
     """
 
-    of_w: Floats = field(repr=False)
-    of_b: Floats = field(repr=False)
-    of_e: Floats = field(repr=False)
     of_parts: Floats = field(repr=False)
     by_w: Floats = field(repr=False)
     right: Floats = field(repr=False)
     rest: Floats
     rest_w: Floats
+
+    @property
+    def of_w(self) -> Floats:
+        """Regression of the error of the model at each place on w, (n, t)."""
+        return self.of_parts[:, : self.by_w.size] * self.by_w
+
+    @property
+    def of_b(self) -> Floats:
+        """The same on b, (n, t)."""
+        return np.asarray(self.of_parts[:, self.by_w.size :] @ self.right[:, : self.by_w.size])
+
+    @property
+    def of_e(self) -> Floats:
+        """The same on the white errors, (n, t)."""
+        return np.asarray(self.of_parts[:, self.by_w.size :] @ self.right[:, self.by_w.size :])
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,12 +130,8 @@ def estimator(modes: Modes) -> Estimator:
     rest_w = model.variance - (ratio * h).sum(axis=1)
     rest = rest_w + model.busbar * phases - (by_b * C).sum(axis=1)
     rest += model.flicker * phases - (by_e * by_e).sum(axis=1)
-    of_b = by_b @ modes.back
-    left, right = _factors(np.hstack([of_b, by_e]))
+    left, right = _factors(np.hstack([by_b @ modes.back, by_e]))
     return Estimator(
-        of_w=ratio,
-        of_b=of_b,
-        of_e=by_e,
         of_parts=np.hstack([h, left]),
         by_w=by_w,
         right=right,
@@ -183,7 +189,8 @@ def _mean(made: Estimator, w: Floats, b: Floats, e: Floats) -> Floats:
 def _variance(modes: Modes, made: Estimator, cov: Floats, static: Static, loads: float) -> Floats:
     """Variance by the covariance of the modes (3, t) and of the directions, (n,)."""
     moved = _theta(modes, made, static)
-    by_w, by_b = made.of_w - made.of_e, made.of_b - made.of_e
+    of_e = made.of_e
+    by_w, by_b = made.of_w - of_e, made.of_b - of_e
     out = (by_w * by_w) @ cov[0] + (by_b * by_b) @ cov[2] + 2.0 * ((by_w * by_b) @ cov[1])
     out += made.rest + (loads - 1.0) * made.rest_w + ((moved @ static.cov) * moved).sum(axis=1)
     return np.asarray(np.maximum(out, 0.0))

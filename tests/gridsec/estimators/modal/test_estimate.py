@@ -188,12 +188,18 @@ def test_the_honest_source_agrees_with_its_model() -> None:
 
 
 def test_factors_of_the_regression_are_the_whole() -> None:
-    """``of_b`` and ``of_e`` by the modes and a few directions: the busbar's, and those of unequal meters."""
+    """The regression on (b, e) by a few directions: the busbar's, and those of unequal meters."""
     model = some_meters()
     made = modes(model)
-    prepared = estimate.estimator(made)
+    prepared, at, H = estimate.estimator(made), made.at, model.phases(made.at)
+    C = model.busbar * (model.busbar_of @ H.T)
+    of_w = model.of_meters[:, at] @ made.U / made.loads
+    of_b = np.linalg.solve(model.static(at), C.T).T @ made.back
+    of_e = model.flicker * (model.busbar_of @ H.T @ made.U)
+    for found, exact in ((prepared.of_w, of_w), (prepared.of_b, of_b), (prepared.of_e, of_e)):
+        assert np.allclose(found, exact, rtol=0.0, atol=1e-12)
     w, b, e = np.random.default_rng(4).standard_normal((3, 5))
-    expected = prepared.of_w @ w + prepared.of_b @ b + prepared.of_e @ e
+    expected = of_w @ w + of_b @ b + of_e @ e
     assert np.allclose(estimate._mean(prepared, w, b, e), expected, rtol=0.0, atol=1e-12)
     even = some_meters()
     even = replace(even, white=np.full(5, 1e-5), fixed=np.full(5, 2e-5))
