@@ -187,11 +187,23 @@ def _mean(made: Estimator, w: Floats, b: Floats, e: Floats) -> Floats:
 
 
 def _variance(modes: Modes, made: Estimator, cov: Floats, static: Static, loads: float) -> Floats:
-    """Variance by the covariance of the modes (3, t) and of the directions, (n,)."""
-    moved = _theta(modes, made, static)
-    of_e = made.of_e
-    by_w, by_b = made.of_w - of_e, made.of_b - of_e
-    out = (by_w * by_w) @ cov[0] + (by_b * by_b) @ cov[2] + 2.0 * ((by_w * by_b) @ cov[1])
+    """Variance by the covariance of the modes (3, t) and of the directions, (n,).
+
+    With e = z - w - b the regression is ``h diag(by_w) - L R_e`` on w and ``L (R_b - R_e)`` on b. Its squares
+    are those of h and a few products, so that no array but h has n t entries.
+    """
+    t, (var_w, both, var_b), G, (g_w, g_b) = made.by_w.size, cov, modes.directions, static.signature
+    h, L, D = made.of_parts[:, :t], made.of_parts[:, t:], made.by_w
+    R_b, R_e = made.right[:, :t], made.right[:, t:]
+    S = R_b - R_e
+    inner = (R_e * var_w) @ R_e.T + (S * var_b) @ S.T
+    mixed = (R_e * both) @ S.T
+    inner -= mixed + mixed.T
+    of_h = h @ np.hstack([D[:, None] * (S * both - R_e * var_w).T, (D * g_w)[:, None] * G])
+    out = (h * h) @ (D * D * var_w) + ((2.0 * of_h[:, : L.shape[1]] + L @ inner) * L).sum(axis=1)
+    # Change of the estimate per amount of each direction, (n, r).
+    moved = R_b @ (G * (1.0 - g_b)[:, None]) - R_e @ (G * (1.0 - g_w - g_b)[:, None])
+    moved = L @ moved - of_h[:, L.shape[1] :]
     out += made.rest + (loads - 1.0) * made.rest_w + ((moved @ static.cov) * moved).sum(axis=1)
     return np.asarray(np.maximum(out, 0.0))
 
@@ -205,14 +217,6 @@ def _full_variance(modes: Modes, made: Estimator, full: Full, loads: float) -> F
     more = (loads - 1.0) * made.rest_w + unread
     out = ((by @ full.cov) * by).sum(axis=1) + made.rest + more
     return np.asarray(np.maximum(out, 0.0))
-
-
-def _theta(modes: Modes, made: Estimator, static: Static) -> Floats:
-    """Change of the estimate per amount of each direction, (n, r)."""
-    g_w, g_b = static.signature
-    G = modes.directions
-    by_w, by_b = made.of_w @ (G * g_w[:, None]), made.of_b @ (G * (1.0 - g_b)[:, None])
-    return np.asarray(by_b - by_w - made.of_e @ (G * (1.0 - g_w - g_b)[:, None]))
 
 
 def moves(  # noqa: PLR0917  # the state, and the faults
