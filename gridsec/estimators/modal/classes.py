@@ -27,6 +27,11 @@ inequality, that happens by chance in at most one of gamma starts, as long as th
 model's distributions. With an enlarged covariance, after missing readings and restarts, Lambda is
 approximate. The comparison is beside the detector: it says nothing about an onset.
 
+**Errors alike.** The filter takes own errors for independent. Classes do not say so: meters of one kind may
+all be at the same end. Such an error looks like one of the busbar's meter in the opposite direction. With the
+score y and the information F of the busbar's phase since the start, it gains ``max 2 y c - c^2 F`` over
+``|c| <= a``. A fault since the start counts only where it gains more by ``2 log (p gamma)``.
+
 References
 ----------
 .. [1] Wasserman, Ramdas and Balakrishnan, Universal inference, PNAS 117, 2020.
@@ -140,6 +145,22 @@ def exceeding(  # noqa: PLR0917  # the filter, and the meters with the limit
         log gamma.
     """
     return log_lambda(made, modes, state, static, counted) >= limit + log(made.fixed.size)
+
+
+def common(score: Floats, information: Floats, most: Floats) -> float:
+    """Twice the logarithm of the likelihood that errors within the classes gain, alike in each phase.
+
+    Errors of several phases are bounded one by one, so that the gain may be larger.
+
+    Parameters
+    ----------
+    score, information : (b,), (b, b)
+        Score and information of the phases.
+    most : (b,)
+        Largest error within the class of every meter of a phase, squared pu.
+    """
+    error = np.clip(np.linalg.lstsq(information, score)[0], -most, most)
+    return float(2.0 * (error @ score) - error @ information @ error)
 
 
 def log_lambda(made: Classes, modes: Modes, state: FilterState, static: Static, counted: Bools) -> Floats:

@@ -505,7 +505,7 @@ class Suspicion:
     found
         The explanations.
     fits
-        The best one explains the misfit since then.
+        The best one explains the misfit since then, and better than errors alike within the classes.
     """
 
     row: int
@@ -541,7 +541,8 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     if best:
         found = _searched(core, state, rows[best], known)
     found = collusion.weighed(mirrors.reflected(found, core.near), state.masked.meters, core.near)
-    fits = _fits(state, found, int(test.onsets.age[rows[best]]))
+    age = int(test.onsets.age[rows[best]])
+    fits = _fits(state, found, age) and not (age >= test.ticks and _aligned(core, found))
     return Suspicion(rows[best], found if fits else replace(found, named=np.zeros_like(found.named)), fits)
 
 
@@ -561,6 +562,21 @@ def _fits(state: CoreState, found: Identification, age: int) -> bool:
         if gain >= EXPLAINED * (model.misfit - chance) and (number == 0 or model.unsteady < OFTEN):
             return True
     return False
+
+
+def _aligned(core: Core, found: Identification) -> bool:
+    """All meters at one end of their classes explain the readings since the start nearly as well.
+
+    A class bounds an error, and does not say that errors are independent. The limit is that of
+    `classes.exceeding`.
+    """
+    problem, chosen = found.problems[int(found.model[0])], found.chosen[0]
+    first = core.modes.size + core.faults.powers
+    # The error that all meters of a phase may have.
+    most = np.where(core.modes.phases > 0.0, core.classes.allowed[:, None], inf).min(axis=0)
+    alike = classes.common(problem.y[first:], problem.F[first:, first:], most)
+    gain = float(problem.y[chosen] @ mean_amounts(problem, chosen))
+    return gain - alike < 2.0 * (core.limit + log(core.modes.size))
 
 
 def _keeping(found: Identification) -> Bools:

@@ -22,6 +22,9 @@ The estimate uses the standard deviations themselves: d is estimated from the re
 
 n being the meters with a reading.
 
+Powers that nothing tells are wrong together: low by night, and too high where customers collude. The share
+`COMMON_SHARE` of their variance is common, and a direction of its own.
+
 **Loads that jump.** The error of a power follows the power. Its half-width l is that of the frame; for a
 reactive power that the model adds, it is that power as well. Let l rise by d_j in a tick, and by m_j shortly
 before. The error has changed by a number of the variance ``(m_j + d_j)^2 / 3``. The part ``m_j^2 / 3`` has
@@ -48,7 +51,13 @@ from gridsec.arrays import Bools, Floats, all_of, any_of, indices
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.plant import usual
 from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.measurements import ClockSkew, FrameUncertainty, Measurements
+from gridsec.estimators.sequential.measurements import (
+    COMMON_SHARE,
+    ClockSkew,
+    FrameUncertainty,
+    Measurements,
+    unread_powers,
+)
 from gridsec.estimators.sequential.posterior import EXACT, UNMETERED
 from gridsec.interface import PowerOrigin
 
@@ -240,15 +249,23 @@ def _powers(
     frame = usual(measured.frame)
     p = _wider(frame.p_error, doubt.smooth_p, uncertainty.p[0] > 1.0, doubt.sudden_p)
     q = _wider(frame.q_error, doubt.smooth_q, uncertainty.q[0] > 1.0, doubt.sudden_q)
-    power = np.concatenate([p, q])
+    power, columns, factors = np.concatenate([p, q]), list[Floats](), list[Floats]()
+    unread = np.tile(unread_powers(design, uncertainty.p[0], uncertainty.read[0]), 2)
+    which = indices((power > 0.0) & unread)
+    if which.size:
+        shared = design.sensitivities.numbered(which) @ power[which]
+        columns, factors = [np.sqrt(COMMON_SHARE) * shared[:, None]], [np.array([WIDER])]
+        power[which] *= np.sqrt(1.0 - COMMON_SHARE)
     wide = WIDER * power
     if unsettled is not None:
         more, factor = unsettled
+        q = power[p.size :]
         power[p.size :], wide[p.size :] = np.hypot(q, more), np.hypot(WIDER * q, factor * more)
     which = indices(power > 0.0)
-    if not which.size:
-        return [], np.zeros(0)
-    return [design.sensitivities.numbered(which) * power[which]], wide[which] / power[which]
+    if which.size:
+        columns.append(design.sensitivities.numbered(which) * power[which])
+        factors.append(wide[which] / power[which])
+    return columns, np.concatenate([np.zeros(0), *factors])
 
 
 def _wider(error: Floats, known: Floats, wider: Bools, sudden: Floats | None) -> Floats:

@@ -255,6 +255,8 @@ def explanations(
 ) -> tuple[Explanation, ...]:
     """Reported explanations, the likeliest first; sets that differ in the loads only are one.
 
+    None where the best one does not explain the misfit.
+
     Parameters
     ----------
     design, core
@@ -264,7 +266,7 @@ def explanations(
     uses_q : (N,)
         Customers with a metered reactive power in the model: there the report is wrong, not the inverter.
     """
-    if suspicion is None:
+    if suspicion is None or not suspicion.fits:
         return ()
     found, p = suspicion.found, core.modes.size
     owner, last = design.plant.droop.customer, design.customers

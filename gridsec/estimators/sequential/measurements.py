@@ -421,7 +421,7 @@ _LEAST_EFFECT = 0.5
 """Part of the accuracy class by which late or excessive powers must be able to move a voltage to count."""
 
 
-_COMMON_SHARE = 0.5
+COMMON_SHARE = 0.5
 """Common share of the variance of unread powers."""
 
 
@@ -558,6 +558,11 @@ def _customers(design: SequentialDesign, meters: Bools) -> Bools:
     return out
 
 
+def unread_powers(design: SequentialDesign, p: Floats, read: Bools) -> Bools:
+    """Customers with a power that nothing tells, (N,): p and read are those of one scale."""
+    return np.asarray((p > 1.0) & _customers(design, ~read))
+
+
 def _prior(design: SequentialDesign, p: Floats, q: Floats, busbar: Bools, read: Bools) -> Prior:
     if all_of(busbar) and all_of(p == 1.0) and all_of(q == 1.0):
         return design.prior
@@ -565,8 +570,7 @@ def _prior(design: SequentialDesign, p: Floats, q: Floats, busbar: Bools, read: 
     together = design.doubt.together
     if not all_of(read):
         # Unread powers are low together by night, with a meter as without.
-        unread = (p > 1.0) & _customers(design, ~read)
-        together = np.where(unread, np.maximum(together, _COMMON_SHARE), together)
+        together = np.where(unread_powers(design, p, read), np.maximum(together, COMMON_SHARE), together)
     doubt = replace(
         design.doubt,
         together=together,

@@ -171,3 +171,30 @@ def test_another_manipulation_is_named_beside_it_and_a_named_meter_exceeds_no_cl
     assert np.flatnonzero(after.exceeding).tolist() == [LIAR]
     both = replace(suspicion, found=replace(suspicion.found, named=suspicion.found.named | (lie(1.0) > 0.0)))
     assert not core.mask(kernel, state, both)[0].exceeding.any()
+
+
+def test_the_gain_of_errors_alike_is_that_of_a_bounded_error() -> None:
+    """Against a grid of one phase; two phases that share no meter count apart, and silent ones not at all."""
+    y, F, most = 3.0, 2.0, 1.2
+    error = np.linspace(-most, most, 2001)
+    best = float((2.0 * error * y - F * error**2).max())
+    assert classes.common(np.array([y]), np.array([[F]]), np.array([most])) == pytest.approx(best)
+    two = classes.common(np.array([y, -y]), F * np.eye(2), np.array([most, 10.0]))
+    assert two == pytest.approx(best + y * y / F)
+    assert classes.common(np.zeros(1), np.zeros((1, 1)), np.array([most])) == 0.0
+
+
+@pytest.mark.parametrize(("classes_off", "fits"), [(-1.0, False), (3.0, True)])
+def test_errors_alike_within_the_classes_are_no_fault_of_the_busbar(classes_off: float, fits: bool) -> None:
+    """All meters at one end of their class, far coarser than that of the busbar, and three times as far."""
+    model = replace(MODEL, busbar=1e-6, fixed=4.0 * MODEL.fixed)
+    allowed, blind = np.sqrt(3.0 * model.fixed), np.zeros((13, METERS))
+    kernel = core.assemble(model, blind, np.full(METERS, 0.1), gamma=1e3, allowed=allowed)
+    source, state = Source(model, np.random.default_rng(5)), core.init(kernel, 0.0)
+    source.b = classes_off * allowed
+    for k in range(4):
+        state, evidence = core.step(kernel, state, float(k), source.tick())
+        assert core.alarmed(kernel, evidence)
+        suspicion = core.identify(kernel, state, evidence)
+        assert np.flatnonzero(suspicion.found.chosen[0]).tolist() == [kernel.bound.size - 1]
+        assert suspicion.fits is fits

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from benchmarks._residuals import Dense, Source, power_columns, tree
@@ -12,7 +14,7 @@ from gridsec.estimators.modal.costs import SearchProblem
 from gridsec.estimators.modal.doubts import Unknown
 from gridsec.estimators.modal.model import modes
 from gridsec.estimators.modal.signatures import Joint
-from gridsec.estimators.sequential.measurements import measurements, nominal_uncertainty
+from gridsec.estimators.sequential.measurements import COMMON_SHARE, measurements, nominal_uncertainty
 from gridsec.grid.network import Power
 from tests.gridsec.estimators.modal.test_core import MODEL
 from tests.gridsec.estimators.modal.test_filter import proportional
@@ -83,6 +85,25 @@ def test_an_injection_that_follows_the_estimate_is_wider_by_its_own_factor() -> 
     assert (
         doubts.unknown(front, measured, nominal_uncertainty(front), 2.0 * usual, ~free & free, None) is None
     )
+
+
+def test_unread_powers_are_wrong_together() -> None:
+    """Their errors have the common share of the front end; the sum of k is k times as uncertain as one."""
+    plant = make_plant(np.random.default_rng(5), customers=12, drop=0.08)
+    front, street = prepare(plant), Street(plant, np.random.default_rng(6))
+    one, unread, usual = np.ones(12, dtype=np.bool_), np.arange(12) < 3, nominal_uncertainty(front)
+    frame = street.frame()
+    frame = replace(frame, p_error=np.where(unread, 0.2, frame.p_error))
+    measured = measurements(front, frame, one, one[:1], 1.0)
+    known = replace(usual, p=np.where(unread, 4.0, usual.p), read=usual.read & ~unread[plant.meters])
+    none = np.zeros(plant.droop.customer.size)
+    given = doubts.unknown(front, measured, known, none, none > 0.0, None)
+    assert given is not None
+    std = np.sqrt(0.2**2 / 3.0 - front.doubt.smooth_p[unread] ** 2)
+    columns = front.sensitivities.columns(Power.ACTIVE, np.flatnonzero(unread)) * std
+    between = (1.0 - COMMON_SHARE) * np.eye(3) + COMMON_SHARE
+    assert np.allclose(given.places @ given.places.T, columns @ between @ columns.T)
+    assert np.allclose(given.wide @ given.wide.T, doubts.WIDER**2 * given.meters @ given.meters.T)
 
 
 def test_the_estimate_is_the_gaussian_one() -> None:
