@@ -41,7 +41,7 @@ reading and one that the model adds are not compared.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import exp, sqrt
 
 import numpy as np
@@ -97,12 +97,15 @@ class Unknown:
         Factor of the filter on the standard deviations, 1.
     unchecked : (p,)
         Meters with a reading that no known power checks.
+    powers
+        Number of the first directions, those of powers and injections.
     """
 
     places: Floats = field(repr=False)
     meters: Floats = field(repr=False)
     factor: Floats
     unchecked: Bools
+    powers: int
 
     @property
     def wide(self) -> Floats:
@@ -143,13 +146,13 @@ def unknown(  # noqa: PLR0917  # the state, and one frame
     clocks = _clocks(design, measured, skew)
     if not columns and clocks is None:
         return None
-    whole = np.hstack([np.zeros((places, 0)), *columns])
+    whole, powers = np.hstack([np.zeros((places, 0)), *columns]), factor.size
     meters = whole[design.prior.meters]
     if clocks is not None:
         whole = np.hstack([whole, np.zeros((places, clocks.shape[1]))])
         meters = np.hstack([meters, clocks])
     factor = np.concatenate([factor, np.full(whole.shape[1] - factor.size, WIDER)])
-    return Unknown(whole, meters, factor, measured.available & ~uncertainty.vouched[0])
+    return Unknown(whole, meters, factor, measured.available & ~uncertainty.vouched[0], powers)
 
 
 def reach(design: SequentialDesign) -> Floats:
@@ -307,11 +310,14 @@ def _clocks(design: SequentialDesign, measured: Measurements, skew: ClockSkew | 
     return out
 
 
-def estimated(modes: Modes, given: Unknown, u: Floats, seen: Bools) -> tuple[Floats, Floats]:
+def estimated(
+    modes: Modes, given: Unknown, u: Floats, seen: Bools, *, hidden: bool = False
+) -> tuple[Floats, Floats]:
     """Mean and variance of the unknown errors at all places, (n,) each, squared pu and squared pu^2.
 
     A reading that no known power checks may be false. Let m' and V' be the mean and the variance without all
-    of these readings, and m the mean with them: the variance is ``V' + (m - m')^2`` about m.
+    of these readings, and m the mean with them: the variance is ``V' + (m - m')^2`` about m. Where meters may
+    hide behind powers, m' and V' are those without any knowledge of the powers.
 
     Parameters
     ----------
@@ -321,9 +327,16 @@ def estimated(modes: Modes, given: Unknown, u: Floats, seen: Bools) -> tuple[Flo
         Residuals less the posterior means of w and b.
     seen : (p,)
         Meters with a reading in use.
+    hidden
+        No reading narrows the variance of powers and injections.
     """
     mean, variance = _regressed(modes, given, u, seen)
-    if any_of(given.unchecked & seen):
+    if hidden:
+        powers, others = given.places[:, : given.powers], given.places.copy()
+        others[:, : given.powers] = 0.0
+        other, variance = _regressed(modes, replace(given, places=others), u, seen)
+        variance = variance + (powers**2).sum(axis=1) + (mean - other) ** 2
+    elif any_of(given.unchecked & seen):
         other, variance = _regressed(modes, given, u, seen & ~given.unchecked)
         variance = variance + (mean - other) ** 2
     return mean, variance

@@ -630,10 +630,8 @@ def _estimate(
             plain = core.estimate(kernel, state.core)
             u = u - (mean - plain.mean)[front.prior.meters]
             read = read & ~verdict.accused(kernel, state.suspicion)
-        given = tick.unknown
-        if all_of(np.asarray(measured.busbar_metered)) and _hidden(state.core, given):
-            given = replace(given, unchecked=read)
-        off, more = doubts.estimated(kernel.modes, given, u, read)
+        hidden = _hidden(state.core, tick.unknown)
+        off, more = doubts.estimated(kernel.modes, tick.unknown, u, read, hidden=hidden)
         mean = mean + off
     v2_bus, first = tick.predicted.v2_bus + mean, plant.feeder.busbar_places()
     metered = measured.busbar_metered

@@ -110,7 +110,7 @@ def test_the_estimate_is_the_gaussian_one() -> None:
     """Mean and variance equal those of dense conditioning; unchecked readings widen the variance only."""
     made, random = modes(MODEL), np.random.default_rng(3)
     places, at = random.standard_normal((13, 2)) * 0.01, MODEL.meters
-    given = Unknown(places, places[at], WIDE, np.zeros(12, dtype=np.bool_))
+    given = Unknown(places, places[at], WIDE, np.zeros(12, dtype=np.bool_), 2)
     u, seen = 0.01 * random.standard_normal(12), np.arange(12) != 5
     mean, variance = doubts.estimated(made, given, u, seen)
     whole = np.block(
@@ -123,7 +123,7 @@ def test_the_estimate_is_the_gaussian_one() -> None:
     gain = np.linalg.solve(whole[np.ix_(n, n)], whole[n, :13]).T
     assert np.allclose(mean, gain @ u[seen])
     assert np.allclose(variance, np.diag(whole)[:13] - np.diag(gain @ whole[n, :13]), atol=1e-12)
-    doubted = Unknown(places, places[at], WIDE, np.arange(12) == 2)
+    doubted = Unknown(places, places[at], WIDE, np.arange(12) == 2, 2)
     same, wider = doubts.estimated(made, doubted, u, seen)
     other, less = doubts.estimated(made, given, u, seen & (np.arange(12) != 2))
     assert np.allclose(same, mean)
@@ -131,10 +131,26 @@ def test_the_estimate_is_the_gaussian_one() -> None:
     assert (wider >= variance - 1e-15).all()
 
 
+def test_behind_unread_powers_readings_narrow_the_busbar_only() -> None:
+    """Power and busbar unknown: the variance is that of the power, and the posterior one of the busbar."""
+    made, random = modes(MODEL), np.random.default_rng(7)
+    power, at = 0.01 * random.standard_normal((13, 1)), MODEL.meters
+    places, seen, u = np.hstack([power, np.ones((13, 1))]), np.arange(12) != 5, random.standard_normal(12)
+    given = Unknown(places, places[at], WIDE, np.zeros(12, dtype=np.bool_), 1)
+    mean, variance = doubts.estimated(made, given, u, seen, hidden=True)
+    same, _ = doubts.estimated(made, given, u, seen)
+    assert np.allclose(mean, same)
+    n = at[seen]
+    V = places[n] @ places[n].T + made.noise[np.ix_(seen, seen)]
+    of_busbar = np.linalg.solve(V, np.ones(n.size))
+    busbar, left = float(of_busbar @ u[seen]), 1.0 - float(of_busbar.sum())
+    assert np.allclose(variance, left + power[:, 0] ** 2 + (mean - busbar) ** 2)
+
+
 def test_without_readings_nothing_is_known() -> None:
     """The variance is that of the directions."""
     places = np.ones((13, 1))
-    given = Unknown(places, places[MODEL.meters], WIDE[:1], np.zeros(12, dtype=np.bool_))
+    given = Unknown(places, places[MODEL.meters], WIDE[:1], np.zeros(12, dtype=np.bool_), 1)
     mean, variance = doubts.estimated(modes(MODEL), given, np.ones(12), np.zeros(12, dtype=np.bool_))
     assert not mean.any()
     assert np.allclose(variance, 1.0)
