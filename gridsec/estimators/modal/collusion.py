@@ -3,17 +3,21 @@
 The penalty of a set of meters is a prior: few are likelier than many. It may decide as long as one fault
 alone explains the readings. Where an explanation has several faults, or meters are masked already, an
 adversary has chosen the meters, and its choice has no prior. Let C be the accused meters of one sign in the
-likeliest explanation J, and L the cost without the penalty of meters. A set g of other meters in place of C
-is an explanation of its own, at ``max(0, L((J - C) + g) - L(J))`` beyond J. C is not named where that is less
-than
+likeliest explanation J, and L the cost without the penalty of meters. A set g of meters with one amount in
+place of C is an explanation of its own, at ``max(0, L((J - C) + g) - L(J))`` beyond J. It has other meters
+than C, or also some of C with the reverse sign. Let A be the meters of C that g lacks. They are not named
+where that is less than
 
-    max(2 log(1 / DOUBT), MISFIT (L(J - C) - L(J)))
+    max(2 log(1 / DOUBT), MISFIT (L(J - A) - L(J)))
+
+Beside the other liars, one that lies by less seems off by the reverse, as honest meters do. It is in both C
+and g. The sets are taken by their L, and each that keeps further names counts as an explanation.
 
 Steps and ramps describe a drift of unknown onset and shape to a share of its evidence only, `MISFIT`. The
 promise limits g: (J - C) + g and the masked meters are at most M or a third, whichever is larger. An
 explanation of more meters names none.
 
-**Decoys.** A meter of C that no g replaces must not protect the others. Where no g replaces C, the lateral
+**Decoys.** A meter of C that no g replaces must not protect the others. Where no g keeps a name, the lateral
 with the most of C, but not all, splits it. Both parts are checked by themselves, and split again up to
 `SPLITS` times: honest meters that seem off together are neighbours.
 
@@ -25,15 +29,16 @@ included. The customer with possible amounts that lowers L most is added until n
 **Search of g.** Given the amounts of the rest J - C, g has the information F and the scores y. One amount x
 has the relaxation
 
-    minimise  x^2 g' F g / 2 - x y' g,      0 <= g <= 1,      g = 0 on C
+    minimise  x^2 g' F g / 2 - x y' g,      0 <= g <= 1
 
-which is convex [1]_. With any amounts of the sign, and independent ones of the rest, it is a minimum over
-z >= 0 of all meters outside of C, ``z' F z / 2 - z' y``, a bound. Where that is above the limit of a naming,
-the meters with the largest z are the only g. Elsewhere the relaxation's solution orders the meters. The best
+which is convex [1]_. With any amounts of the sign, and independent ones of the rest, it is a minimum over z
+>= 0 of all usable meters, ``z' F z / 2 - z' y``, a bound. Where that is above the limit of a naming, the
+meters with the largest z are the only g. Elsewhere the relaxation's solution orders the meters. The best
 beginning of this order is improved by single meters and by exchanges. x is first the mean amount of C, then
 that of the set found. Where that gains nothing and the solution has more meters than the promise, x is
-larger. g is also looked for in place of the rest's meters of its own sign, since colluding meters may share
-one amount, and of its faults that are no meters.
+larger. Where the best g has meters of C, the best one without them is also found. g is also looked for in
+place of the rest's meters of its own sign, since colluding meters may share one amount, and of its faults
+that are no meters.
 
 References
 ----------
@@ -75,6 +80,8 @@ LARGER = 1.5
 """Next amount over the largest one tried where the relaxation has more meters than are promised, 1."""
 ITERATIONS = 300
 """Largest number of iterations of the relaxation; most take below 100."""
+_LEAST = -2.0 * log(DOUBT)
+"""Difference of L below which a set contests a name in any case, 1: the limit of a naming."""
 _COUNTS = -2.0 * log(2.0 * DOUBT)
 """Largest cost of a set that contests a name: twice the weight from which on a set counts in the variance."""
 ALIKE_LESS = 3.0
@@ -84,7 +91,7 @@ HALF = 0.5
 
 
 def weighed(found: Identification, masked: Bools, near: Neighbourhoods) -> Identification:
-    """Explanations with sets of other meters that may replace accused ones.
+    """Explanations with sets of meters that may replace accused ones.
 
     Parameters
     ----------
@@ -105,28 +112,23 @@ def weighed(found: Identification, masked: Bools, near: Neighbourhoods) -> Ident
     model = int(found.model[0])
     problem, amount = found.problems[model], np.zeros(J.size)
     amount[J] = mean_amounts(problem, J)
-    by_model, least = costs_of(found), -2.0 * log(DOUBT)
-    contested = np.zeros(p, dtype=np.bool_)
+    by_model, contested = costs_of(found), np.zeros(p, dtype=np.bool_)
     # The onset may be older than that of a masked meter, which J then has, too.
-    parts = [(sign, J[:p] & ~masked & (sign * amount[:p] > 0.0), SPLITS) for sign in _SIGNS]
+    parts = [(J[:p] & ~masked & (sign * amount[:p] > 0.0), SPLITS) for sign in _SIGNS]
     while parts:
-        sign, accused, splits = parts.pop()
+        accused, splits = parts.pop()
         if not any_of(accused & named):
             continue
-        own, without = _own(problem, J, accused, sign)
-        limit = max(least, MISFIT * (without - own))
-        sets = _instead(problem, J, amount, accused, masked, most, (without, own + limit))
-        others = _customers(problem, _without(J, accused), accused, masked, most, near.powers)
-        each, other = min(chain(sets, others), key=lambda one: one[0])
-        more = max(0.0, each - own)
-        if more < limit:
-            contested |= accused & named
-            key = other.tobytes()
-            # No more than J: few meters are likelier than many. What keeps names back counts in the estimate.
-            cost = min(by_model[model][J.tobytes()] + max(more, GAIN), _COUNTS)
-            by_model[model][key] = min(cost, by_model[model].get(key, inf))
-        elif splits:
-            parts += [(sign, part, splits - 1) for part in _split(accused, near.laterals)]
+        for more, other in _contesting(problem, J, amount, accused, masked, most, near.powers):
+            kept = accused & named & ~other[:p] & ~contested
+            if any_of(kept):
+                contested |= kept
+                # No more than J: few meters are likelier than many. What keeps names counts in the estimate.
+                cost = min(by_model[model][J.tobytes()] + max(more, GAIN), _COUNTS)
+                key = other.tobytes()
+                by_model[model][key] = min(cost, by_model[model].get(key, inf))
+        if splits and not any_of(accused & contested):
+            parts += [(part, splits - 1) for part in _split(accused, near.laterals)]
     if not any_of(contested):
         return found
     out = identified(found.problems, by_model)
@@ -142,6 +144,34 @@ def _own(problem: SearchProblem, J: Bools, accused: Bools, sign: float) -> tuple
     return min(whole, without + alike), without
 
 
+def _contesting(  # noqa: PLR0917  # one explanation
+    problem: SearchProblem,
+    J: Bools,
+    amount: Floats,
+    accused: Bools,
+    masked: Bools,
+    most: int,
+    powers: Ints,
+) -> list[tuple[float, Bools]]:
+    """Differences of L from J, and sets (q,) that keep names of meters accused, (p,): the likeliest first."""
+    own, without = _own(problem, J, accused, _sign(amount, accused))
+    limit = own + max(_LEAST, MISFIT * (without - own))
+    sets = _instead(problem, J, amount, accused, masked, most, (without, limit))
+    others = _customers(problem, _without(J, accused), accused, masked, most, powers)
+    found = sorted((one for one in chain(sets, others) if one[0] < limit), key=lambda one: one[0])
+    if not found:
+        return []
+    lacking = np.stack([_without(J, accused & ~other[: problem.meters]) for _, other in found])
+    more = [max(0.0, each - own) for each, _ in found]
+    near = more < np.maximum(_LEAST, MISFIT * (_evidence(problem, lacking) - own))
+    return [(one, other) for one, (_, other), some in zip(more, found, near, strict=True) if some]
+
+
+def _sign(amount: Floats, meters: Bools) -> float:
+    """Sign of the amounts, (q,), of some meters, (p,), which have the same."""
+    return float(np.sign(amount[: meters.size] @ meters))
+
+
 def _instead(  # noqa: PLR0917  # one explanation
     problem: SearchProblem,
     J: Bools,
@@ -151,32 +181,33 @@ def _instead(  # noqa: PLR0917  # one explanation
     most: int,
     between: tuple[float, float],
 ) -> Iterator[tuple[float, Bools]]:
-    """L of sets without the meters accused, (p,), and the sets, (q,).
+    """L of sets without the meters accused, (p,), or with the reverse sign of some, and the sets, (q,).
 
     between: L of the explanation without the meters accused, and the limit that L of a set is to fall below.
     """
     p, rest, (without, limit) = problem.meters, _without(J, accused), between
-    size = float(np.abs(amount[:p][accused]).mean())
+    size, reverse = float(np.abs(amount[:p][accused]).mean()), -_sign(amount, accused)
     yield without, rest
     kept = []
     fewer: list[tuple[Bools, tuple[float, ...]]] = [(rest & (np.arange(rest.size) < p), _SIGNS)]
     fewer += [(_without(rest, sign * amount[:p] > 0.0), (sign,)) for sign in _SIGNS]
     for each, signs in [(rest, _SIGNS), *(one for one in fewer if not np.array_equal(one[0], rest))]:
-        at, y, F = _beside(problem, each, ~(each[:p] | accused))
+        at, y, F = _beside(problem, each, ~each[:p])
         room = most - int(np.count_nonzero(each[:p] | masked))
         begun = without if each is rest else float(_evidence(problem, each[None])[0])
+        s2, own = float(problem.std[0]) ** 2, accused[at]
         for sign in signs:
-            one = _Relaxed(sign * y, F, float(problem.std[0]) ** 2, ~masked[at], room)
-            least, inside = one.bound()
-            searched = begun + least < limit + ALIKE_LESS
-            if searched:
-                least, inside = one.best(size)
-            if any_of(inside):
-                both = each.copy()
-                both[at[inside]] = True
-                kept.append(both)
-                if searched:
+            relaxed = _Relaxed(sign * y, F, s2, ~masked[at], room)
+            # The best set without any of them may keep more names.
+            for barred in (np.zeros_like(own), own) if sign == reverse else (own,):
+                least, inside = relaxed.found(size, barred, limit + ALIKE_LESS - begun)
+                if any_of(inside):
+                    both = each.copy()
+                    both[at[inside]] = True
+                    kept.append(both)
                     yield begun + least, both
+                if least == inf or not any_of(inside & own):
+                    break
     if kept:
         yield from zip(_evidence(problem, np.stack(kept)).tolist(), kept, strict=True)
 
@@ -316,6 +347,15 @@ class _Relaxed:
     s2: float
     counted: Bools
     room: int
+
+    def found(self, amount: float, barred: Bools, limit: float) -> tuple[float, Bools]:
+        """Least fit without the meters barred, (k,), and its set; infinite where the bound excludes all."""
+        n, out = np.flatnonzero(~barred), np.zeros_like(barred)
+        part = _Relaxed(self.y[n], submatrix(self.F, n, n), self.s2, self.counted[n], self.room)
+        least, inside = part.bound()
+        least, inside = part.best(amount) if least < limit else (inf, inside)
+        out[n[inside]] = True
+        return least, out
 
     def best(self, amount: float) -> tuple[float, Bools]:
         """Least fit of one amount, at most 0, and its set, (k,)."""

@@ -144,6 +144,69 @@ def test_an_honest_meter_amid_colluding_ones_is_contested() -> None:
     assert (contested(false, NONE, 4) == some(0, 1, 2, 3)).all()
 
 
+def evidence(given: SearchProblem, sets: Bools) -> Floats:
+    """L of sets of meters, (k,), by the covariances of the amounts: independent ones and amounts alike."""
+    out = []
+    for each in sets:
+        n = np.flatnonzero(each)
+        F, y, one = given.F[np.ix_(n, n)], given.y[n], np.eye(n.size)
+        own, alike = (
+            np.linalg.slogdet(one + P @ F)[1] - y @ np.linalg.solve(one + P @ F, P @ y)
+            for P in (one, ALIKE * np.ones_like(F) + (1.0 - ALIKE) * one)
+        )
+        both = 2.0 * np.log(2.0) - 2.0 * np.logaddexp(-0.5 * own, -0.5 * (alike + given.charge.max()))
+        out.append(both if n.size > 1 else own)
+    return np.array(out)
+
+
+def by_enumeration(given: SearchProblem, accused: Bools, sign: float, most: int) -> Bools:
+    """Meters accused (p,), all of one sign, that any set of meters with one amount replaces, (p,)."""
+    every = np.array([each for each in product((False, True), repeat=METERS) if sum(each) <= most])
+    a, b = every @ given.y[:METERS], np.vecdot(every @ given.F[:METERS, :METERS], every)
+    one = np.log1p(b) - a * a / (b + 1.0)
+    # Members of the set accused have the reverse sign.
+    usable = ~(every & accused).any(axis=1) | (sign * a < 0.0)
+    L = np.where(usable, np.minimum(evidence(given, every), one), inf)
+    own = min(evidence(given, accused[None])[0], one[(every == accused).all(axis=1)][0])
+    against = evidence(given, accused & every) - own
+    near = L - own < np.maximum(2.0 * np.log(1e3), 0.1 * against)
+    return np.asarray((accused & ~every[near]).any(axis=0))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_accused_meters_with_the_reverse_sign_contest_others(seed: int) -> None:
+    """Meters 0 to 3 read high, 3 by less: beside the others the honest 4 and 5 seem low, and so does 3."""
+    given, accused = street(0.8 * some(0, 1, 2) + 0.6 * some(3), seed), some(3, 4, 5)
+    found = contested(explanation(given, accused), NONE, 4)
+    assert found[[4, 5]].all()
+    assert (found == by_enumeration(given, accused, -1.0, 4)).all()
+
+
+@pytest.mark.parametrize(("amount", "members"), [(0.6, ()), (0.3, (4,))])
+def test_the_evidence_against_meters_that_a_set_lacks_is_compared(
+    amount: float, members: tuple[int, ...]
+) -> None:
+    """Meters 3 and 4 share a branch. Most evidence is against both: the reverse of 3 explains it, too."""
+    V = NOISE * np.eye(METERS) + SHARED * np.kron(np.eye(2), np.ones((6, 6)))
+    F = np.zeros((METERS + 1, METERS + 1))
+    F[:METERS, :METERS] = 100.0 * np.linalg.inv(V + np.outer(some(3, 4), some(3, 4)))
+    given = replace(street(np.zeros(METERS)), y=F[:, 4] * amount + F[:, 3] * 0.05, F=F)
+    accused = some(3, 4)
+    both, three, none = evidence(given, np.stack([accused, some(3), NONE]))
+    assert three - both < collusion.MISFIT * (none - both)
+    found = contested(explanation(given, accused), NONE, 4)
+    assert (found == some(*members)).all()
+    assert (found == by_enumeration(given, accused, 1.0, 4)).all()
+
+
+def test_a_set_that_contests_a_part_is_reported() -> None:
+    """The meter that both explanations accuse stays named."""
+    given = street(0.8 * some(0, 1, 2) + 0.6 * some(3))
+    out = collusion.weighed(explanation(given, some(3, 4, 5)), NONE, near(4))
+    assert (out.named == some(3)).all()
+    assert (out.chosen[1, :METERS] == some(0, 1, 2, 3)).all()
+
+
 def test_meters_that_nothing_replaces_are_named() -> None:
     """Two meters of different laterals, off by far more than others can feign."""
     lie = 2.0 * some(0, 6).astype(np.float64)
