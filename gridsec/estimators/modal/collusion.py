@@ -11,7 +11,8 @@ where that is less than
     max(2 log(1 / DOUBT), MISFIT (L(J - A) - L(J)))
 
 Beside the other liars, one that lies by less seems off by the reverse, as honest meters do. It is in both C
-and g. The sets are taken by their L, and each that keeps further names counts as an explanation.
+and g. The sets without any of C are taken first, then by their L. Each that keeps further names counts as an
+explanation.
 
 Steps and ramps describe a drift of unknown onset and shape to a share of its evidence only, `MISFIT`. The
 promise limits g: (J - C) + g and the masked meters are at most M or a third, whichever is larger. An
@@ -153,18 +154,24 @@ def _contesting(  # noqa: PLR0917  # one explanation
     most: int,
     powers: Ints,
 ) -> list[tuple[float, Bools]]:
-    """Differences of L from J, and sets (q,) that keep names of meters accused, (p,): the likeliest first."""
+    """Differences of L from J, and sets (q,) that keep names of meters accused, (p,).
+
+    Those without any of them are first, then the likeliest.
+    """
     own, without = _own(problem, J, accused, _sign(amount, accused))
     limit = own + max(_LEAST, MISFIT * (without - own))
     sets = _instead(problem, J, amount, accused, masked, most, (without, limit))
     others = _customers(problem, _without(J, accused), accused, masked, most, powers)
-    found = sorted((one for one in chain(sets, others) if one[0] < limit), key=lambda one: one[0])
+    found = [
+        (any_of(accused & one[1][: accused.size]), *one) for one in chain(sets, others) if one[0] < limit
+    ]
     if not found:
         return []
-    lacking = np.stack([_without(J, accused & ~other[: problem.meters]) for _, other in found])
-    more = [max(0.0, each - own) for each, _ in found]
+    found.sort(key=lambda one: one[:2])
+    lacking = np.stack([_without(J, accused & ~other[: accused.size]) for *_, other in found])
+    more = [max(0.0, each - own) for _, each, _ in found]
     near = more < np.maximum(_LEAST, MISFIT * (_evidence(problem, lacking) - own))
-    return [(one, other) for one, (_, other), some in zip(more, found, near, strict=True) if some]
+    return [(one, other) for one, (*_, other), some in zip(more, found, near, strict=True) if some]
 
 
 def _sign(amount: Floats, meters: Bools) -> float:

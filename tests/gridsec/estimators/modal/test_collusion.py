@@ -207,6 +207,17 @@ def test_a_set_that_contests_a_part_is_reported() -> None:
     assert (out.chosen[1, :METERS] == some(0, 1, 2, 3)).all()
 
 
+def test_one_set_without_the_meters_accused_is_reported_alone() -> None:
+    """A likelier one with the reverse sign of meter 3 keeps no further name."""
+    given, accused = street(0.8 * some(0, 1, 2) + 0.6 * some(3), 3), some(3, 4, 5)
+    likelier, other = evidence(given, np.stack([some(0, 1, 2, 3), some(0, 1, 2)]))
+    assert likelier < other
+    out = collusion.weighed(explanation(given, accused), NONE, near(4))
+    assert not out.named.any()
+    assert len(out.chosen) == 2
+    assert not (out.chosen[1, :METERS] & accused).any()
+
+
 def test_meters_that_nothing_replaces_are_named() -> None:
     """Two meters of different laterals, off by far more than others can feign."""
     lie = 2.0 * some(0, 6).astype(np.float64)
