@@ -1,8 +1,10 @@
 """Cost of many feeders in one process: time by stage, rates of decoding, meters held at one reading a second.
 
     python -m benchmarks.fleet [SECONDS] [MOST] [FIRST] [OTHER_TREE] [--costs] [--workers] [--json] [--arrow]
+        [--sequential]
 
 Feeders are copies of the Kerber suburban network, 146 meters and the busbar each. All ratios are of one run.
+With --sequential the estimator of the feeders is `sequential` in place of the default.
 
 1. Stages: an engine without zenoh takes calm ticks of four feeders, as single JSON readings and as batches in
    Arrow, CBOR and JSON. Processor time of each stage, as a multiple of the estimator's step.
@@ -21,10 +23,15 @@ The processor time of a reading is that of the service and its workers, without 
 
 from __future__ import annotations
 
+import os
+
+# Before NumPy loads its libraries; the service limits them itself.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import json
 import math
 import multiprocessing
-import os
 import re
 import sys
 import tempfile
@@ -47,7 +54,7 @@ from benchmarks._arguments import arguments
 from benchmarks.overload import START_S, Service, free_ports, metrics, renamed, running, ticks
 from feeders.format.tables import to_json, write
 from feeders.model.site import Site, from_tables, load
-from feeders.registry import DesignedEstimator
+from feeders.registry import SEQUENTIAL, DesignedEstimator, choose
 from feeders.simulation.plant import BUSBAR
 from feeders.simulation.scenario import Scenario, SimulatedReading, simulate
 from service.cli.simulate import key_of
@@ -611,9 +618,9 @@ TICK_MAX, SINGLES_MIN, BATCHES_MIN = 3.0, 0.2, 1e5
 
 def main() -> int:
     """Measure."""
-    options = dict.fromkeys(("costs", "workers", "json", "arrow"), False)
+    options = dict.fromkeys(("costs", "workers", "json", "arrow", "sequential"), False)
     asked = arguments(__doc__, seconds=20.0, most=200, first=FIRST, against="", **options)
-    site = load(FEEDER)
+    site = choose(load(FEEDER), estimator=SEQUENTIAL if asked.sequential else None)
     if asked.against:
         print_against(site, asked.seconds, Path(asked.against).resolve())
         return 0
