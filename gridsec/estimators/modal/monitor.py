@@ -17,9 +17,9 @@ The residual of a meter is its squared reading less the model; fixed errors are 
 Registers err in proportion to v2: with b at 1 pu, ``b (v2 - 1)`` by the mean of b before the tick is no part
 of the residual. A meter is named when a search names it and `CONFIRM` searches in turn have it in their
 likeliest explanations, when one search names it as the only fault with `CONFIRM` readings since the onset,
-or when it repeats its readings beyond chance. Named meters are masked from the onset on, and released by
-their readings (`masking`). The busbar's meter is named by searches in turn; its phase then counts as not
-metered, until the meters agree with its reading again.
+or when it repeats its readings beyond chance. An explanation is named whole, or one search later. Named
+meters are masked from the onset on, and released by their readings (`masking`). The busbar's meter is named
+by searches in turn. Its phase then counts as not metered, until both agree.
 """
 
 from __future__ import annotations
@@ -366,8 +366,10 @@ def _identified(
         return _unsuspected(state), evidence
     if tick < state.due or not core.alarmed(kernel, evidence):
         return replace(state, suspicion=suspicion), evidence
+    masked = state.core.masked.meters
+    waited = suspicion is not None and any_of(suspicion.found.named & ~masked)
     suspicion = core.identify(kernel, state.core, evidence, suspicion)
-    named = suspicion.found.named & ~state.core.masked.meters
+    named = suspicion.found.named & ~masked
     streak = np.where(suspicion.found.chosen[0, : named.size], state.streak + 1, 0)
     certain = verdict.certain_phases(kernel, suspicion) & suspicion.fits
     phases = np.where(certain, state.phases + 1, 0)
@@ -380,12 +382,12 @@ def _identified(
     after = replace(
         state, suspicion=suspicion, streak=streak, phases=phases, inverters=inverters, due=tick + wait
     )
-    since = () if any_of(state.core.masked.meters) else state.core.history.readings[-age:]
-    sure = confirmed(suspicion.found, named, streak, since)
+    since = () if any_of(masked) else state.core.history.readings[-age:]
+    sure = confirmed(suspicion.found, named, streak, since, waited=waited)
     if any_of(sure):
         found = replace(suspicion.found, named=sure)
-        masked, evidence = core.mask(kernel, state.core, replace(suspicion, found=found))
-        return replace(after, core=masked, suspicion=None, streak=0 * streak, due=tick + 1), evidence
+        now, evidence = core.mask(kernel, state.core, replace(suspicion, found=found))
+        return replace(after, core=now, suspicion=None, streak=0 * streak, due=tick + 1), evidence
     if any_of(phases >= CONFIRM):
         return _without_busbar(design, after, suspicion, phases >= CONFIRM)
     faulty = suspicion.found.chosen.any(axis=1)
@@ -397,7 +399,9 @@ def _identified(
     return after, evidence
 
 
-def confirmed(found: Identification, named: Bools, streak: Ints, since: Sequence[Reading]) -> Bools:
+def confirmed(
+    found: Identification, named: Bools, streak: Ints, since: Sequence[Reading], *, waited: bool = False
+) -> Bools:
     """Meters that a search names finally, (p,).
 
     Parameters
@@ -410,13 +414,17 @@ def confirmed(found: Identification, named: Bools, streak: Ints, since: Sequence
         Searches in turn with each in the likeliest explanation.
     since
         Ticks since the suspected onset; none where meters are masked, and may collude with others.
+    waited
+        The search before has named meters, too.
     """
     sole = np.flatnonzero(named)
     if sole.size == 1 and np.count_nonzero(found.chosen[0]) == 1:
         readings = sum(seen is None or bool(seen[sole[0]]) for _, _, seen, *_ in since)
         if readings >= CONFIRM:
             return named
-    return np.asarray(named & (streak >= CONFIRM))
+    sure = np.asarray(named & (streak >= CONFIRM))
+    # Without a part of the meters, other faults may explain the rest: one more search may name all.
+    return sure if waited or np.array_equal(sure, named) else np.zeros_like(sure)
 
 
 def _unsuspected(state: ModalState) -> ModalState:
@@ -549,16 +557,14 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         learning=learning,
         last=(estimate, answer),
     )
-    mean = None
-    if state.suspicion is None:
-        mean = (estimate.v2_bus - tick.predicted.v2_bus)[front.prior.meters]
+    mean = (estimate.v2_bus - tick.predicted.v2_bus)[front.prior.meters]
     out = changed(
         state,
         front=after,
         kept=kept or state.kept,
         held=tick.held,
         injections=tick.injections.reset(fed),
-        fit=drive.fitted(design.core, kernel, state.fit, now.ticks, mean),
+        fit=drive.fitted(design.core, kernel, state.fit, now.ticks, None if state.suspicion else mean),
     )
     return (out if learning is None else _learned(design, out)), estimate, answer
 

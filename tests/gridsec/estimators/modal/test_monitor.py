@@ -58,8 +58,11 @@ def test_a_part_of_several_faults_needs_searches_in_turn(faults: tuple[int, ...]
 
 
 def test_meters_that_are_named_by_turns_of_different_length_are_apart() -> None:
-    streak = CONFIRM * mask(1) + mask(3)
-    assert confirmed(found(1, 3), mask(1, 3), streak, ticks(None, None)).tolist() == mask(1).tolist()
+    """An explanation is named whole; the search after the first naming takes what is confirmed."""
+    streak, since = CONFIRM * mask(1) + mask(3), ticks(None, None)
+    assert confirmed(found(1, 3), mask(1, 3), streak, since, waited=True).tolist() == mask(1).tolist()
+    assert not confirmed(found(1, 3), mask(1, 3), streak, since).any()
+    assert confirmed(found(1, 3), mask(1, 3), streak + mask(3), since).tolist() == mask(1, 3).tolist()
 
 
 def test_a_meter_that_is_accused_but_not_named_is_not_final() -> None:
