@@ -35,7 +35,6 @@ from gridsec.estimators.modal import classes, core, doubts, drive, full, masking
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.doubts import Movements, Unknown
-from gridsec.estimators.modal.drive import Fit
 from gridsec.estimators.modal.estimate import Reconstructed, Spread
 from gridsec.estimators.modal.record import Record
 from gridsec.estimators.modal.replay import Reading
@@ -210,7 +209,7 @@ class ModalState:
     kept: Record | None
     held: Ints
     injections: InjectionError
-    fit: Fit
+    fit: drive.Fit
     movements: Movements | None = None
 
     @property
