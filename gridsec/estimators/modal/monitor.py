@@ -17,7 +17,7 @@ The residual of a meter is its squared reading less the model; fixed errors are 
 Registers err in proportion to v2: with b at 1 pu, ``b (v2 - 1)`` by the mean of b before the tick is no part
 of the residual. A meter is named when a search names it and `CONFIRM` searches in turn have it in their
 likeliest explanations, when one search names it as the only fault with `CONFIRM` readings since the onset,
-or when it repeats its readings beyond chance. An explanation is named whole, or one search later. Named
+or when it repeats its readings beyond chance. An explanation is named whole, or after `APART` ones. Named
 meters are masked from the onset on, and released by their readings (`masking`). The busbar's meter is named
 by searches in turn. Its phase then counts as not metered, until both agree.
 """
@@ -90,6 +90,8 @@ CONFIRM = 2
 
 One reading may be an outlier, and the first explanation of several faults a part of them.
 """
+APART = 2 * CONFIRM
+"""Searches in turn after which a meter is named beside others that are not confirmed yet."""
 LOOKS = 16
 """Searches per age of the suspected onset: explanations change ever more slowly."""
 SETTLING = 32
@@ -366,7 +368,6 @@ def _identified(
     if tick < state.due or not core.alarmed(kernel, evidence):
         return replace(state, suspicion=suspicion), evidence
     masked = state.core.masked.meters
-    waited = suspicion is not None and any_of(suspicion.found.named & ~masked)
     suspicion = core.identify(kernel, state.core, evidence, suspicion)
     named = suspicion.found.named & ~masked
     streak = np.where(suspicion.found.chosen[0, : named.size], state.streak + 1, 0)
@@ -382,7 +383,7 @@ def _identified(
         state, suspicion=suspicion, streak=streak, phases=phases, inverters=inverters, due=tick + wait
     )
     since = () if any_of(masked) else state.core.history.readings[-age:]
-    sure = confirmed(suspicion.found, named, streak, since, waited=waited)
+    sure = confirmed(suspicion.found, named, streak, since)
     if any_of(sure):
         found = replace(suspicion.found, named=sure)
         now, evidence = core.mask(kernel, state.core, replace(suspicion, found=found))
@@ -398,9 +399,7 @@ def _identified(
     return after, evidence
 
 
-def confirmed(
-    found: Identification, named: Bools, streak: Ints, since: Sequence[Reading], *, waited: bool = False
-) -> Bools:
+def confirmed(found: Identification, named: Bools, streak: Ints, since: Sequence[Reading]) -> Bools:
     """Meters that a search names finally, (p,).
 
     Parameters
@@ -413,17 +412,15 @@ def confirmed(
         Searches in turn with each in the likeliest explanation.
     since
         Ticks since the suspected onset; none where meters are masked, and may collude with others.
-    waited
-        The search before has named meters, too.
     """
     sole = np.flatnonzero(named)
     if sole.size == 1 and np.count_nonzero(found.chosen[0]) == 1:
         readings = sum(seen is None or bool(seen[sole[0]]) for _, _, seen, *_ in since)
         if readings >= CONFIRM:
             return named
-    sure = np.asarray(named & (streak >= CONFIRM))
-    # Without a part of the meters, other faults may explain the rest: one more search may name all.
-    return sure if waited or np.array_equal(sure, named) else np.zeros_like(sure)
+    # Without a part of the meters, other faults may explain the rest: a few more searches may name all.
+    least = CONFIRM if all_of(streak[named] >= CONFIRM) else APART
+    return np.asarray(named & (streak >= least))
 
 
 def _unsuspected(state: ModalState) -> ModalState:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gridsec.arrays import Bools
-from gridsec.estimators.modal.monitor import CONFIRM, confirmed, design, init, own_errors, step
+from gridsec.estimators.modal.monitor import APART, CONFIRM, confirmed, design, init, own_errors, step
 from gridsec.estimators.modal.replay import Reading
 from gridsec.estimators.modal.search import Identification
 from gridsec.estimators.modal.verdict import combined
@@ -58,11 +58,12 @@ def test_a_part_of_several_faults_needs_searches_in_turn(faults: tuple[int, ...]
 
 
 def test_meters_that_are_named_by_turns_of_different_length_are_apart() -> None:
-    """An explanation is named whole; the search after the first naming takes what is confirmed."""
+    """An explanation is named whole; after `APART` searches in turn a meter is named by itself."""
     streak, since = CONFIRM * mask(1) + mask(3), ticks(None, None)
-    assert confirmed(found(1, 3), mask(1, 3), streak, since, waited=True).tolist() == mask(1).tolist()
-    assert not confirmed(found(1, 3), mask(1, 3), streak, since).any()
     assert confirmed(found(1, 3), mask(1, 3), streak + mask(3), since).tolist() == mask(1, 3).tolist()
+    assert not confirmed(found(1, 3), mask(1, 3), streak, since).any()
+    later = streak + (APART - CONFIRM) * mask(1)
+    assert confirmed(found(1, 3), mask(1, 3), later, since).tolist() == mask(1).tolist()
 
 
 def test_a_meter_that_is_accused_but_not_named_is_not_final() -> None:
