@@ -81,12 +81,12 @@ def fitted(
     mean : (p,)
         Errors of the model at the meters, squared pu; None where a fault is suspected.
     """
-    plain = before is not None and mean is not None and state.filter.full is None
-    if before is not None and plain and ticks > LEARNING and ticks % RENEWED:
-        own = before.own
-    else:
+    if before is None or mean is None or state.filter.full is not None:
+        return Fit(classes.means(core.classes, core.modes, state.filter, state.static))
+    own = before.own
+    if ticks <= LEARNING or ticks % RENEWED == 0:
         own = classes.means(core.classes, core.modes, state.filter, state.static)
-    return Fit(own, mean + own if plain and mean is not None else None)
+    return Fit(own, mean + own)
 
 
 def expected(v2: Floats, own: Floats) -> Floats:

@@ -397,7 +397,7 @@ class Columns:
     @cached_property
     def others(self) -> tuple[Floats, Floats]:
         """Columns of powers and busbar, (t, q - members), and their squares."""
-        W = self.W[:, self.members :].copy()
+        W = self.W[:, self.members :]
         return W, W * W
 
     @cached_property
