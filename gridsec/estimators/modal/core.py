@@ -67,8 +67,6 @@ CONNECTION = 0.1
 """Power of a customer where the files are not asked, pu of the feeder's base: 10 kW at 100 kVA."""
 FARTHER = 5.0
 """Log M of an onset above that of all pinned ones from which on it replaces them, 1; a replay takes time."""
-LASTS = 0.2
-"""Standard deviation of a lasting error along an unknown direction, in that of one tick of the filter, 1."""
 EXPLAINED = 0.25
 """Share of the misfit since the onset from which on the best explanation counts as one, 1.
 
@@ -334,7 +332,7 @@ def step(  # noqa: PLR0917  # the state, and one tick
         made, core.faults, state.detector, update, known, h=h, alert=CALM * core.limit
     )
     if any_of(masked.meters) and after.full is not None:
-        masked = masking.follow(made, masked, after.full, m, read)
+        masked = masking.follow(made, masked, after.full, update.exact, m, read, unknown)
     beyond = state.beyond
     if test.ticks <= EARLY or test.ticks % EARLY == 0:
         beyond = classes.exceeding(core.classes, made, after, known, ~masked.meters, core.limit)
@@ -385,7 +383,10 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
         return seen if k < first else ~named if seen is None else seen & ~named, unknown
 
     now, evidence = again(core, state, first, masked, begun)
-    return replace(now, masked=masking.added(state.masked, named)), evidence
+    amount = np.zeros(core.effect.shape[1])
+    chosen = suspicion.found.chosen[0]
+    amount[chosen] = mean_amounts(suspicion.found.problems[int(suspicion.found.model[0])], chosen)
+    return replace(now, masked=masking.added(state.masked, named, amount[: named.size])), evidence
 
 
 def again(
@@ -636,13 +637,13 @@ def _problem(core: Core, joint: Joint, unknown: Floats | None) -> tuple[SearchPr
     """Scores, information and charges of all faults at one onset, and the gain of evidence by unknown errors.
 
     The filter takes the error along an unknown direction as white. One that lasts since the onset would count
-    against a set of faults at every tick. Its amount, N(0, `LASTS`^2) of the direction, is integrated out:
-    with scores y and information F of faults and directions n,
+    against a set of faults at every tick. Its amount, N(0, LASTS^2) of the direction as in `masking`, is
+    integrated out: with scores y and information F of faults and directions n,
 
         M = F_nn + 1,  y - F_n M^-1 y_n,  F - F_n M^-1 F_n',  gain = (y_n' M^-1 y_n - log det M) / 2
     """
     faults, p, q = core.faults, core.modes.size, core.faults.std.size
-    W = faults.W if unknown is None else np.hstack([faults.W, LASTS * (core.modes.U.T @ unknown)])
+    W = faults.W if unknown is None else np.hstack([faults.W, masking.LASTS * (core.modes.U.T @ unknown)])
     y, F = joint.of(W)
     gain = 0.0
     if unknown is not None:

@@ -801,11 +801,7 @@ def renew(design: ModalDesign, state: ModalState, which: Bools) -> ModalState:
     blank = core.init(design.core, kernel.filter.t)
     opened = replace(kernel.filter, full=replace(whole.changed(mean, cov), complete=0))
     parts = opened, kernel.static, blank.detector
-    masked = masking.Masked(
-        kernel.masked.meters & ~which,
-        np.where(which, 0, kernel.masked.count),
-        np.where(which, 0.0, kernel.masked.total),
-    )
+    masked = masking.without(kernel.masked, which)
     begun = replace(
         blank,
         filter=opened,

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks._residuals import Dense, Source, power_columns, tree
 from gridsec.arrays import Floats
-from gridsec.estimators.modal import core, costs, doubts, full, static
+from gridsec.estimators.modal import core, costs, doubts, full, masking, static
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.costs import SearchProblem
 from gridsec.estimators.modal.doubts import Unknown
@@ -170,7 +170,7 @@ def test_the_search_integrates_lasting_errors_out() -> None:
     whole = SearchProblem(
         y,
         F,
-        np.concatenate([plain.std, np.full(2, core.LASTS)]),
+        np.concatenate([plain.std, np.full(2, masking.LASTS)]),
         12,
         np.concatenate([plain.charge, np.zeros(2)]),
         np.full(y.size, np.inf),

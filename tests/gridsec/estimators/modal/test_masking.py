@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import pickle  # the states of this test only
 from dataclasses import replace
 from types import SimpleNamespace
@@ -10,8 +11,9 @@ import numpy as np
 import pytest
 
 from benchmarks._residuals import Source
-from gridsec.estimators.modal import core, masking, replay
+from gridsec.estimators.modal import core, full, masking, replay
 from gridsec.estimators.modal.core import Core
+from gridsec.estimators.modal.filter import Interval
 from tests.gridsec.estimators.modal.test_core import MODEL
 
 FIRST, SECOND = 4, 9
@@ -61,19 +63,92 @@ def test_a_release_takes_readings_until_their_mean_is_sharp(kernel: Core, noise:
     """White variances of 0.5 to 1e6 times the variance of the filter; one reading in between disagrees."""
     p = kernel.modes.size
     quiet = SimpleNamespace(noise=noise * np.eye(p))
-    mean, variance, meter = np.zeros((2, p)), np.ones(p), np.eye(p)[FIRST]
-    full = SimpleNamespace(mean=mean, variance=variance)
+    none, meter = np.zeros((p, p)), np.eye(p)[FIRST]
+    posterior = SimpleNamespace(mean=np.zeros((2, p)), blocks=(np.eye(p), none, none))
     masked, far = masking.added(masking.none(kernel.modes), meter > 0.0), 10.0 * np.sqrt(1.0 + noise) * meter
     for k, m in enumerate([np.zeros(p), far, *ticks * [np.zeros(p)]]):
         assert masked.meters[FIRST], k
-        masked = masking.follow(quiet, masked, full, m, None)
+        masked = masking.follow(quiet, masked, posterior, None, m, None)
     assert not masked.meters.any()
     masked = masking.added(masked, meter > 0.0)
     # A mean beyond `AGREES` of its deviations releases nothing.
     for _ in range(masking.MOST + 1):
         off = 1.2 * masking.AGREES * np.sqrt(1.0 + noise / masking.RELEASE) * meter
-        masked = masking.follow(quiet, masked, full, off, None)
+        masked = masking.follow(quiet, masked, posterior, None, off, None)
     assert masked.meters[FIRST]
+
+
+def test_deviations_beside_unknown_directions(kernel: Core) -> None:
+    """Oracle: the dense joint law of w + b, the lasting amounts and the readings of one tick."""
+    random, modes, p = np.random.default_rng(5), kernel.modes, 12
+    begun = core.init(kernel, 0.0)
+    at, rows, unknown = np.array([2, 7]), np.delete(np.arange(p), [2, 7]), 0.01 * random.normal(size=(p, 3))
+    before = full.expanded(modes, begun.filter, begun.static)
+    gap, m, seen = Interval(1.0), 0.01 * random.normal(size=p), np.isin(np.arange(p), rows)
+    after, tick = full.updated(modes, before, gap, m, seen, unknown)
+    off, P = masking.deviations(after, tick, m, at, unknown)
+    rho, rho_b = gap.decay(modes)
+    w, both, b = before.blocks
+    prior = rho**2 * w + rho * rho_b * (both + both.T) + rho_b**2 * b
+    prior += (1.0 - rho**2) * modes.covariance_w + (1.0 - rho_b**2) * modes.covariance_b
+    # The filter's own law of w + b, with wide amounts; the lasting amounts by the law without that part.
+    of, wide = prior[:, rows], unknown[rows] @ unknown[rows].T
+    alone = prior[np.ix_(rows, rows)] + modes.noise[np.ix_(rows, rows)]
+    U, nu = unknown[rows], m[rows]
+    C = np.linalg.inv(np.eye(3) / masking.LASTS**2 + U.T @ np.linalg.solve(alone, U))
+    amounts = C @ U.T @ np.linalg.solve(alone, nu)
+    posterior = prior - of @ np.linalg.solve(alone + wide, of.T)
+    with_amounts = -of @ np.linalg.solve(alone + wide, U) @ unknown.T
+    found = posterior + with_amounts + with_amounts.T + unknown @ C @ unknown.T
+    mean = of @ np.linalg.solve(alone + wide, nu)
+    assert pytest.approx(found[np.ix_(at, at)], rel=1e-9, abs=1e-15) == P
+    assert off[at] == pytest.approx((m - mean - unknown @ amounts)[at], rel=1e-9)
+
+
+def test_evidence_of_honesty_against_all_sets() -> None:
+    """Oracle: all sets of six meters. None, some or all go on by nearly the amounts last seen."""
+    random, k, other = np.random.default_rng(0), 6, 0
+    sets = [np.array(each) for each in itertools.product([False, True], repeat=k)]
+    for trial in range(200):
+        S = 1e-5 * random.uniform(0.5, 4.0) + np.diag(1e-6 * random.uniform(0.2, 2.0, k))
+        amount = random.uniform(0.003, 0.02, k) if trial % 2 else np.full(k, 0.01)
+        lies = amount * (random.random(k) < random.choice([0.0, 0.5, 1.0]))
+        mean = np.linalg.cholesky(S) @ random.normal(size=k) + lies * (1.0 + 0.1 * random.normal(size=k))
+        costs = []
+        for J in sets:
+            off = mean - amount * J
+            costs.append(off @ np.linalg.solve(S + np.diag((masking.VARIES * amount * J) ** 2), off))
+        least = np.array(
+            [
+                [min(c for J, c in zip(sets, costs, strict=True) if J[j] == go_on) for j in range(k)]
+                for go_on in (True, False)
+            ]
+        )
+        released = 0.5 * (least[0] - least[1]) >= masking.HONEST
+        other += np.count_nonzero(released != (masking.evidence(S, mean, amount) >= masking.HONEST))
+    # Single changes miss the least cost of all sets now and then.
+    assert other <= 3
+
+
+def test_meters_that_collude_within_a_wide_deviation_stay_masked(kernel: Core) -> None:
+    """Four meters alike at 2.5 deviations of their common part agree, and stay masked until they end."""
+    p, four = kernel.modes.size, np.arange(12) < 4
+    none, wide = np.zeros((p, p)), 1e-5 * np.outer(four, four) + 1e-8 * np.eye(p)
+    quiet = SimpleNamespace(noise=1e-7 * np.eye(p))
+    posterior = SimpleNamespace(mean=np.zeros((2, p)), blocks=(wide, none, none))
+    lie = 2.5 * np.sqrt(1e-5) * four
+    masked = masking.added(masking.none(kernel.modes), four, lie)
+    for _ in range(10 * masking.MOST):
+        masked = masking.follow(quiet, masked, posterior, None, lie, None)
+    assert (masked.meters == four).all()
+    # Without a known amount, agreement is enough.
+    unknown = masking.added(masking.none(kernel.modes), four)
+    for _ in range(masking.RELEASE):
+        unknown = masking.follow(quiet, unknown, posterior, None, lie, None)
+    assert not unknown.meters.any()
+    for _ in range(2 * masking.MOST):
+        masked = masking.follow(quiet, masked, posterior, None, np.zeros(p), None)
+    assert not masked.meters.any()
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2])
