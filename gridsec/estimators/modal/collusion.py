@@ -114,13 +114,17 @@ def weighed(found: Identification, masked: Bools, near: Neighbourhoods) -> Ident
     problem, amount = found.problems[model], np.zeros(J.size)
     amount[J] = mean_amounts(problem, J)
     by_model, contested = costs_of(found), np.zeros(p, dtype=np.bool_)
-    # The onset may be older than that of a masked meter, which J then has, too.
-    parts = [(J[:p] & ~masked & (sign * amount[:p] > 0.0), SPLITS) for sign in _SIGNS]
-    while parts:
-        accused, splits = parts.pop()
+    cases = []
+    for sign in _SIGNS:
+        # The onset may be older than that of a masked meter, which J then has, too.
+        accused = J[:p] & ~masked & (sign * amount[:p] > 0.0)
+        cases.append((_Case(problem, J, amount, accused, sign, masked, most, near.powers), SPLITS))
+    while cases:
+        case, splits = cases.pop()
+        accused = case.accused
         if not any_of(accused & named):
             continue
-        for more, other in _contesting(problem, J, amount, accused, masked, most, near.powers):
+        for more, other in case.contesting():
             kept = accused & named & ~other[:p] & ~contested
             if any_of(kept):
                 contested |= kept
@@ -129,123 +133,144 @@ def weighed(found: Identification, masked: Bools, near: Neighbourhoods) -> Ident
                 key = other.tobytes()
                 by_model[model][key] = min(cost, by_model[model].get(key, inf))
         if splits and not any_of(accused & contested):
-            parts += [(part, splits - 1) for part in _split(accused, near.laterals)]
+            cases += [(replace(case, accused=part), splits - 1) for part in _split(accused, near.laterals)]
     if not any_of(contested):
         return found
     out = identified(found.problems, by_model)
     return replace(out, named=out.named & ~contested)
 
 
-def _own(problem: SearchProblem, J: Bools, accused: Bools, sign: float) -> tuple[float, float]:
-    """L of the explanation, with one amount of the meters accused where that is less, and without them."""
-    rest = _without(J, accused)
-    whole, without = _evidence(problem, np.stack([J, rest])).tolist()
-    at, y, F = _beside(problem, rest, accused)
-    alike = _OneSign(sign * y, F, float(problem.std[0]) ** 2, np.ones((1, at.size), dtype=np.bool_)).cost[0]
-    return min(whole, without + alike), without
-
-
-def _contesting(  # noqa: PLR0917  # one explanation
-    problem: SearchProblem,
-    J: Bools,
-    amount: Floats,
-    accused: Bools,
-    masked: Bools,
-    most: int,
-    powers: Ints,
-) -> list[tuple[float, Bools]]:
-    """Differences of L from J, and sets (q,) that keep names of meters accused, (p,).
-
-    Those without any of them are first, then the likeliest.
-    """
-    own, without = _own(problem, J, accused, _sign(amount, accused))
-    limit = own + max(_LEAST, MISFIT * (without - own))
-    sets = _instead(problem, J, amount, accused, masked, most, (without, limit))
-    others = _customers(problem, _without(J, accused), accused, masked, most, powers)
-    found = [
-        (any_of(accused & one[1][: accused.size]), *one) for one in chain(sets, others) if one[0] < limit
-    ]
-    if not found:
-        return []
-    found.sort(key=lambda one: one[:2])
-    lacking = np.stack([_without(J, accused & ~other[: accused.size]) for *_, other in found])
-    more = [max(0.0, each - own) for _, each, _ in found]
-    near = more < np.maximum(_LEAST, MISFIT * (_evidence(problem, lacking) - own))
-    return [(one, other) for one, (*_, other), some in zip(more, found, near, strict=True) if some]
-
-
-def _sign(amount: Floats, meters: Bools) -> float:
-    """Sign of the amounts, (q,), of some meters, (p,), which have the same."""
-    return float(np.sign(amount[: meters.size] @ meters))
-
-
-def _instead(  # noqa: PLR0917  # one explanation
-    problem: SearchProblem,
-    J: Bools,
-    amount: Floats,
-    accused: Bools,
-    masked: Bools,
-    most: int,
-    between: tuple[float, float],
-) -> Iterator[tuple[float, Bools]]:
-    """L of sets without the meters accused, (p,), or with the reverse sign of some, and the sets, (q,).
-
-    between: L of the explanation without the meters accused, and the limit that L of a set is to fall below.
-    """
-    p, rest, (without, limit) = problem.meters, _without(J, accused), between
-    size, reverse = float(np.abs(amount[:p][accused]).mean()), -_sign(amount, accused)
-    yield without, rest
-    kept = []
-    fewer: list[tuple[Bools, tuple[float, ...]]] = [(rest & (np.arange(rest.size) < p), _SIGNS)]
-    fewer += [(_without(rest, sign * amount[:p] > 0.0), (sign,)) for sign in _SIGNS]
-    for each, signs in [(rest, _SIGNS), *(one for one in fewer if not np.array_equal(one[0], rest))]:
-        at, y, F = _beside(problem, each, ~each[:p])
-        room = most - int(np.count_nonzero(each[:p] | masked))
-        begun = without if each is rest else float(_evidence(problem, each[None])[0])
-        s2, own = float(problem.std[0]) ** 2, accused[at]
-        for sign in signs:
-            relaxed = _Relaxed(sign * y, F, s2, ~masked[at], room)
-            # The best set without any of them may keep more names.
-            for barred in (np.zeros_like(own), own) if sign == reverse else (own,):
-                least, inside = relaxed.found(size, barred, limit + ALIKE_LESS - begun)
-                if any_of(inside):
-                    both = each.copy()
-                    both[at[inside]] = True
-                    kept.append(both)
-                    yield begun + least, both
-                if least == inf or not any_of(inside & own):
-                    break
-    if kept:
-        yield from zip(_evidence(problem, np.stack(kept)).tolist(), kept, strict=True)
-
-
 _SIGNS = (1.0, -1.0)
 
 
-def _customers(  # noqa: PLR0917  # one explanation
-    problem: SearchProblem, rest: Bools, accused: Bools, masked: Bools, most: int, powers: Ints
-) -> Iterator[tuple[float, Bools]]:
-    """L of customers with false readings and powers in place of meters accused, (p,), and the sets (q,)."""
-    p, charge = problem.meters, problem.charge.copy()
-    if not any_of(rest[p:]):
-        return
-    charge[powers] = 0.0
-    free, chosen = replace(problem, charge=charge), rest & (np.arange(rest.size) < p)
-    # The powers of masked customers are free, too.
-    least, usable = float(_evidence(free, chosen[None])[0]), (informed(problem) | masked) & ~accused
-    while True:
-        added = np.flatnonzero(usable & ~chosen[powers])
-        sets = np.repeat(chosen[None], added.size, axis=0)
-        sets[np.arange(added.size), added] = sets[np.arange(added.size), powers[added]] = True
-        sets = sets[np.count_nonzero(sets[:, :p] | masked, axis=1) <= most]
-        each = _evidence(free, sets) if len(sets) else np.zeros(0)
-        order = [k for k in np.argsort(each, kind="stable").tolist() if each[k] < least - GAIN]
-        possible = (k for k in order if not any_of(np.abs(mean_amounts(free, sets[k])) > free.bound[sets[k]]))
-        best = next(possible, None)
-        if best is None:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Case:
+    """Accused meters C of one sign in an explanation. p meters, q faults.
+
+    Attributes
+    ----------
+    problem
+        The problem of its model.
+    J, amount : (q,), (q,)
+        The explanation, and its amounts.
+    accused : (p,)
+        The meters C.
+    sign
+        Sign of their amounts.
+    masked : (p,)
+        Masked meters.
+    most
+        Largest number of manipulated meters that is promised.
+    powers : (p,)
+        Fault of each meter's customer that is its false power.
+    """
+
+    problem: SearchProblem
+    J: Bools
+    amount: Floats
+    accused: Bools
+    sign: float
+    masked: Bools
+    most: int
+    powers: Ints
+
+    @property
+    def rest(self) -> Bools:
+        """The explanation without C, (q,)."""
+        return _without(self.J, self.accused)
+
+    def contesting(self) -> list[tuple[float, Bools]]:
+        """Differences of L from J, and sets (q,) that keep names of C: those without any of C, then by L."""
+        own, without = self.own()
+        limit = own + max(_LEAST, MISFIT * (without - own))
+        found = [
+            (any_of(self.accused & one[1][: self.accused.size]), *one)
+            for one in chain(self.instead(without, limit), self.customers())
+            if one[0] < limit
+        ]
+        if not found:
+            return []
+        found.sort(key=lambda one: one[:2])
+        lacking = [_without(self.J, self.accused & ~other[: self.accused.size]) for *_, other in found]
+        more = [max(0.0, each - own) for _, each, _ in found]
+        alone = _evidence(self.problem, np.stack(lacking)) - own
+        near = more < np.maximum(_LEAST, MISFIT * alone)
+        return [(one, other) for one, (*_, other), some in zip(more, found, near, strict=True) if some]
+
+    def own(self) -> tuple[float, float]:
+        """L of the explanation, with one amount of C where that is less, and without C."""
+        problem, rest = self.problem, self.rest
+        whole, without = _evidence(problem, np.stack([self.J, rest])).tolist()
+        at, y, F = _beside(problem, rest, self.accused)
+        every = np.ones((1, at.size), dtype=np.bool_)
+        alike = _OneSign(self.sign * y, F, float(problem.std[0]) ** 2, every).cost[0]
+        return min(whole, without + alike), without
+
+    def instead(self, without: float, limit: float) -> Iterator[tuple[float, Bools]]:
+        """L of sets without C, or with the reverse sign of some, and the sets, (q,).
+
+        Parameters
+        ----------
+        without, limit
+            L of the explanation without C, and the limit that L of a set is to fall below.
+        """
+        problem, p, rest, masked = self.problem, self.problem.meters, self.rest, self.masked
+        size = float(np.abs(self.amount[:p][self.accused]).mean())
+        yield without, rest
+        kept = []
+        for each, signs in self._beginnings():
+            at, y, F = _beside(problem, each, ~each[:p])
+            room = self.most - int(np.count_nonzero(each[:p] | masked))
+            begun = without if np.array_equal(each, rest) else float(_evidence(problem, each[None])[0])
+            s2, own = float(problem.std[0]) ** 2, self.accused[at]
+            for sign in signs:
+                relaxed = _Relaxed(sign * y, F, s2, ~masked[at], room)
+                # The best set without any of them may keep more names.
+                for barred in (np.zeros_like(own), own) if sign == -self.sign else (own,):
+                    least, inside = relaxed.found(size, barred, limit + ALIKE_LESS - begun)
+                    if any_of(inside):
+                        both = each.copy()
+                        both[at[inside]] = True
+                        kept.append(both)
+                        yield begun + least, both
+                    if least == inf or not any_of(inside & own):
+                        break
+        if kept:
+            yield from zip(_evidence(problem, np.stack(kept)).tolist(), kept, strict=True)
+
+    def _beginnings(self) -> list[tuple[Bools, tuple[float, ...]]]:
+        """Sets that others are added to, (q,), and the signs of these: the rest, and parts of it."""
+        p, rest = self.problem.meters, self.rest
+        fewer: list[tuple[Bools, tuple[float, ...]]] = [(rest & (np.arange(rest.size) < p), _SIGNS)]
+        fewer += [(_without(rest, sign * self.amount[:p] > 0.0), (sign,)) for sign in _SIGNS]
+        return [(rest, _SIGNS), *(one for one in fewer if not np.array_equal(one[0], rest))]
+
+    def customers(self) -> Iterator[tuple[float, Bools]]:
+        """L of customers with false readings and powers in place of C, and the sets, (q,)."""
+        problem, rest, masked, powers = self.problem, self.rest, self.masked, self.powers
+        p = problem.meters
+        if not any_of(rest[p:]):
             return
-        chosen, least = sets[best], float(each[best])
-        yield least, chosen
+        charge = problem.charge.copy()
+        charge[powers] = 0.0
+        free, chosen = replace(problem, charge=charge), rest & (np.arange(rest.size) < p)
+        # The powers of masked customers are free, too.
+        least, usable = float(_evidence(free, chosen[None])[0]), (informed(problem) | masked) & ~self.accused
+        while True:
+            added = np.flatnonzero(usable & ~chosen[powers])
+            sets = np.repeat(chosen[None], added.size, axis=0)
+            sets[np.arange(added.size), added] = sets[np.arange(added.size), powers[added]] = True
+            sets = sets[np.count_nonzero(sets[:, :p] | masked, axis=1) <= self.most]
+            each = _evidence(free, sets) if len(sets) else np.zeros(0)
+            order = [k for k in np.argsort(each, kind="stable").tolist() if each[k] < least - GAIN]
+            possible = (
+                k for k in order if not any_of(np.abs(mean_amounts(free, sets[k])) > free.bound[sets[k]])
+            )
+            best = next(possible, None)
+            if best is None:
+                return
+            chosen, least = sets[best], float(each[best])
+            yield least, chosen
 
 
 def _split(meters: Bools, laterals: Bools) -> tuple[Bools, ...]:

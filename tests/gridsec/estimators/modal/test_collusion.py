@@ -320,11 +320,19 @@ def test_customers_with_false_powers_contest_an_honest_meter() -> None:
     assert (contested(shown, some(1), 4, powers=True) == some(4)).all()
 
 
+def instead_of_four(given: SearchProblem, rest: np.ndarray) -> list[tuple[float, np.ndarray]]:
+    """Customers in place of meter 4, beside the rest; at most 4 meters are promised."""
+    J = rest | np.append(some(4), NONE)
+    case = collusion._Case(given, J, 1.0 * J, some(4), 1.0, NONE, 4, OWN)
+    assert (case.rest == rest).all()
+    return list(case.customers())
+
+
 def test_customers_are_added_while_the_evidence_grows() -> None:
     """Each set has one customer more, the best of all, within the promise and with possible powers."""
     given = customers(0.7 * some(0, 9), 3.0 * some(0, 9) + 2.0 * some(3))
     rest, free = np.append(NONE, some(7)), replace(given, charge=np.zeros(2 * METERS))
-    found = list(collusion._customers(given, rest, some(4), NONE, 4, OWN))
+    found = instead_of_four(given, rest)
     assert [int(each[:METERS].sum()) for _, each in found] == [1, 2]
     assert all((each[:METERS] == each[METERS:]).all() for _, each in found)
     every = [np.append(some(k), some(k)) for k in range(METERS) if k != 4]
@@ -335,7 +343,7 @@ def test_customers_are_added_while_the_evidence_grows() -> None:
     # A better customer with an impossible power ends no search.
     first = found[0][1]
     given.bound[METERS:][first[METERS:]] = 0.01
-    other = next(collusion._customers(given, rest, some(4), NONE, 4, OWN))
+    other = instead_of_four(given, rest)[0]
     assert not (other[1] & first).any()
-    assert not list(collusion._customers(bounded, rest, some(4), NONE, 4, OWN))
-    assert not list(collusion._customers(given, np.append(NONE, NONE), some(4), NONE, 4, OWN))
+    assert not instead_of_four(bounded, rest)
+    assert not instead_of_four(given, np.append(NONE, NONE))
