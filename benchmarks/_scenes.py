@@ -6,10 +6,10 @@ in `feeders.simulation.demand` without tap steps; meters have the errors that th
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, depth_first_order, dijkstra
 
 from feeders.format.tables import CustomerRow, FeederMeta, FeederTables, LineRow
-from feeders.model.site import Site, from_tables, load, unread
+from feeders.model.site import Site, Snapshot, from_tables, load, unread
 from feeders.registry import SEQUENTIAL, DesignedEstimator, design
 from feeders.simulation.demand import Variation
 from feeders.simulation.scenario import START, Scenario
@@ -36,8 +36,10 @@ LEARN_S = 6.0 * 3600.0
 """Time over which fixed errors are learned, s."""
 LEARN_STEP_S = 300.0
 """Tick of the learning run, s: 72 readings leave 0.006 % of a meter's jitter."""
-UNREAD = 0.05
-"""Share of the customers without a power reading, at least one customer."""
+UNREAD, SILENT = 0.05, 0.3
+"""Shares of the customers without a power reading, at least one customer."""
+LATE_S, CLOCK_S = 60, 3
+"""Age of late powers, and largest offset of a clock, s; both are whole ticks."""
 PROFILE_S = 13.9 * 86_400.0
 """Length of the summer's profiles, s."""
 _LEAST_OHM = 1e-6
@@ -53,6 +55,17 @@ class Model(StrEnum):
     """Errors of 0.6 kW and 0.2 kvar, correlation time 600 s, known as such."""
     UNREAD = "unread"
     """As MATCHED, but `UNREAD` of the customers report a voltage and no power."""
+    SILENT = "silent"
+    """As MATCHED, but `SILENT` of them."""
+    LATE = "late"
+    """As MATCHED, but every power is `LATE_S` old, and stated so. Errors are learned with fresh powers."""
+    CLOCKS = "clocks"
+    """As MATCHED, but clocks are off by up to `CLOCK_S`, unknown. Errors are learned with exact clocks."""
+
+
+USUAL = (Model.MATCHED, Model.LOADS, Model.UNREAD)
+"""Models that runs take in turn."""
+_SILENT = {Model.UNREAD: UNREAD, Model.SILENT: SILENT}
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,10 +130,35 @@ def without_powers(setting: Setting) -> Bools:
     """Customers without a power reading, (N,)."""
     count = len(site(setting.feeder).tables.customers)
     out = np.zeros(count, dtype=np.bool_)
-    if setting.model is Model.UNREAD:
+    if setting.model in _SILENT:
         random = np.random.default_rng([setting.seed, 5])
-        out[random.choice(count, max(1, round(UNREAD * count)), replace=False)] = True
+        out[random.choice(count, max(1, round(_SILENT[setting.model] * count)), replace=False)] = True
     return out
+
+
+def received(setting: Setting, ticks: Sequence[Snapshot]) -> Iterator[Snapshot]:
+    """Readings of every tick as they are received, with late powers or by clocks that are off.
+
+    Parameters
+    ----------
+    setting
+        The honest world.
+    ticks
+        Readings of the moment, one tick per second.
+    """
+    every, last = np.arange(ticks[0].v_volt.size), len(ticks) - 1
+    offset = np.random.default_rng([setting.seed, 7]).integers(-CLOCK_S, CLOCK_S + 1, every.size)
+    late = setting.model is Model.LATE
+    v, p, q = (np.array([getattr(one, k) for one in ticks]) for k in ("v_volt", "p_kw", "q_kvar"))
+    for k, one in enumerate(ticks):
+        # A clock that is ahead tells the reading of an earlier moment.
+        of = np.clip(k - (LATE_S if late else offset), 0, last) + 0 * every
+        now = replace(one, p_kw=p[of, every], q_kvar=q[of, every])
+        yield (
+            replace(now, p_age_s=np.full(every.size, float(LATE_S)))
+            if late
+            else replace(now, v_volt=v[of, every])
+        )
 
 
 def play(
@@ -144,17 +182,21 @@ def play(
         Manipulations of the meters and of the busbar's meter.
     """
     trial, stated = _trial(setting.feeder, setting.model, step_s)
-    trial = replace(trial, seed=setting.seed, duration_s=duration_s)
+    # Readings of other moments are played, too.
+    beside = {Model.LATE: LATE_S, Model.CLOCKS: CLOCK_S}.get(setting.model, 0) if step_s == 1.0 else 0
+    trial = replace(trial, seed=setting.seed, duration_s=duration_s + 2.0 * beside)
     scenario: Scenario = replace(
         trial.scenario,
-        start=start,
-        profile_s=moment(setting) + start - START,
+        start=start - beside,
+        profile_s=moment(setting) + start - beside - START,
         attacks=attacks,
         busbar_attacks=busbar,
     )
     silent, nothing = without_powers(setting), unread(stated)
-    for frame, truth in frames(trial, scenario, stated=stated):
-        yield (without(frame, nothing, silent) if silent.any() else frame), truth
+    change = partial(received, setting) if beside else iter
+    for frame, truth in frames(trial, scenario, stated=stated, received=change):
+        if start <= frame.t < start + duration_s or not beside:
+            yield (without(frame, nothing, silent) if silent.any() else frame), truth
 
 
 def without(frame: Frame, nothing: Frame, silent: Bools) -> Frame:
@@ -240,7 +282,7 @@ def learn(setting: Setting, step_s: float) -> Learned:
         if verdict.suspects.any():
             raise RuntimeError(f"{setting}: a meter is named while errors are learned")
     # Without all powers some meters, or all, are not learned; that is the state after these hours.
-    if state.learning is not None and setting.model is not Model.UNREAD:
+    if state.learning is not None and setting.model not in _SILENT:
         raise RuntimeError(f"{setting}: nothing is learned")
     return state.learned
 

@@ -8,8 +8,9 @@ truth. Situation and seed determine the run: feeder, learned errors (six hours, 
 classes alone, knowledge of the powers, and size. `matched`: registers and power factors err as the files say.
 `unread`: 5 % of the customers report no power. `loads`: errors of 0.6 kW and 0.2 kvar, known as such. Filters
 skip seeds and do not change the others; `--feeder` also takes a feeder that is none of the situation's, for
-checks beside those. `--estimator modal` watches the same data; the linear programs of
-`stealthy` then still know the limits of the sequential monitor.
+checks beside those. Further models take the place of all: `silent`, 30 % report no power; `late`, powers are
+60 s old, and stated so; `clocks`, clocks are off by up to 3 s, unknown. `--estimator modal` watches the same
+data; the linear programs of `stealthy` then still know the limits of the sequential monitor.
 
 Per situation: runs; runs with an honest meter accused; most honest meters accused in a run; runs with an
 honest busbar meter or inverter accused; ticks CLEAN, UNDECIDED and ATTACKED after the onset, %; manipulated
@@ -41,6 +42,7 @@ from benchmarks import _stealthy
 from benchmarks._arguments import count
 from benchmarks._scenes import (
     ONSET_S,
+    USUAL,
     WATCHED_S,
     Model,
     Setting,
@@ -238,23 +240,28 @@ SITUATIONS = {
 
 
 @cache
-def cells(name: str, feeder: str | None = None) -> tuple[tuple[str, Model, bool, float], ...]:
+def cells(
+    name: str, feeder: str | None = None, model: Model | None = None
+) -> tuple[tuple[str, Model, bool, float], ...]:
     """Feeder, model, learned and size of the runs of a situation, in a fixed mixed order.
 
-    A feeder that is none of the situation's takes the place of all of them.
+    A feeder that is none of the situation's takes the place of all of them, and so does a model.
     """
     one = SITUATIONS[name]
     feeders = one.feeders if feeder is None or feeder in one.feeders else (feeder,)
-    every = list(itertools.product(feeders, Model, (False, True), one.sizes))
+    models = USUAL if model is None or model in USUAL else (model,)
+    every = list(itertools.product(feeders, models, (False, True), one.sizes))
     order = np.random.default_rng(len(every)).permutation(len(every))
     return tuple(every[k] for k in order)
 
 
-def cell(name: str, seed: int, feeder: str | None = None) -> tuple[Setting, float]:
-    """Setting and size of one run; feeder as in `cells`."""
-    every = cells(name, feeder)
-    where, model, learned, size = every[seed % len(every)]
-    return Setting(where, model, learned, seed), size
+def cell(
+    name: str, seed: int, feeder: str | None = None, model: Model | None = None
+) -> tuple[Setting, float]:
+    """Setting and size of one run; feeder and model as in `cells`."""
+    every = cells(name, feeder, model)
+    where, known, learned, size = every[seed % len(every)]
+    return Setting(where, known, learned, seed), size
 
 
 @dataclass(slots=True, eq=False)
@@ -296,7 +303,13 @@ class Run:
 
 
 def run(
-    name: str, seed: int, *, trace: bool = False, estimator: str = SEQUENTIAL, feeder: str | None = None
+    name: str,
+    seed: int,
+    *,
+    trace: bool = False,
+    estimator: str = SEQUENTIAL,
+    feeder: str | None = None,
+    model: Model | None = None,
 ) -> Run:
     """Play and watch one run.
 
@@ -308,11 +321,11 @@ def run(
         Whether to keep a line for every tick.
     estimator
         Name of an estimator.
-    feeder
+    feeder, model
         As in `cells`.
     """
     begun = time.perf_counter()
-    setting, size = cell(name, seed, feeder)
+    setting, size = cell(name, seed, feeder, model)
     where = site(setting.feeder)
     known = "learned" if setting.learned else "classes"
     out = Run(name, seed, f"{setting.feeder} {setting.model} {known} {size:g}")
@@ -403,8 +416,9 @@ def table(runs: list[Run]) -> str:
 
 def seeds(name: str, asked: argparse.Namespace) -> Iterator[int]:
     """Seeds of the runs that pass the filters."""
-    every = range(asked.seed0, asked.seed0 + asked.runs * len(cells(name, asked.feeder)))
-    passing = (seed for seed in every if _passes(*cell(name, seed, asked.feeder), asked))
+    model = None if asked.model is None else Model(asked.model)
+    every = range(asked.seed0, asked.seed0 + asked.runs * len(cells(name, asked.feeder, model)))
+    passing = (seed for seed in every if _passes(*cell(name, seed, asked.feeder, model), asked))
     return itertools.islice(passing, asked.runs)
 
 
@@ -427,16 +441,13 @@ def main(asked: argparse.Namespace) -> int:
     print("|" + "---|" * 14, flush=True)
     failed: list[Run] = []
     names = asked.situation or list(SITUATIONS)
+    model = None if asked.model is None else Model(asked.model)
+    watched = partial(run, trace=asked.trace, estimator=asked.estimator, feeder=asked.feeder, model=model)
     with ProcessPoolExecutor(asked.processes) as pool:
         go = pool.map if asked.processes > 1 else map
         for name in names:
             chosen = list(seeds(name, asked))
-            runs = list(
-                go(
-                    partial(run, name, trace=asked.trace, estimator=asked.estimator, feeder=asked.feeder),
-                    chosen,
-                )
-            )
+            runs = list(go(partial(watched, name), chosen))
             if not runs:
                 print(f"| {name} | 0 |" + " |" * 12)
                 continue

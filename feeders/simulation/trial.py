@@ -9,14 +9,14 @@ The truth is full AC power flow with the droop inverters in closed loop.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from feeders.model.site import Site, from_tables, to_frame
+from feeders.model.site import Site, Snapshot, from_tables, to_frame
 from feeders.simulation.attacks import AttackKind, AttackSpec, manipulations
 from feeders.simulation.demand import Customers, Variation
 from feeders.simulation.plant import MeterErrors
@@ -169,13 +169,17 @@ class FrameTruth:
 
 
 def frames(
-    trial: Trial, scenario: Scenario | None = None, *, stated: Site | None = None
+    trial: Trial,
+    scenario: Scenario | None = None,
+    *,
+    stated: Site | None = None,
+    received: Callable[[Sequence[Snapshot]], Iterable[Snapshot]] = iter,
 ) -> Iterator[tuple[Frame, FrameTruth]]:
     """Simulate a trial, or another scenario on its feeder: frame and truth of each tick.
 
     Customers with an available meter have the powers of the profiles, falsified by the attack, and intervals
     of `LoadError.half_width`. The others, and all without `load_error`, have those of `to_frame`. `stated` is
-    `trial.stated`, if known already.
+    `trial.stated`, if known already. `received` turns the readings of all ticks into those that are received.
 
     Raises NoSuchAttack, PowerFlowDiverged, NoEquilibrium if the attack does not exist on this feeder, or the
         feeder has no solution.
@@ -191,7 +195,9 @@ def frames(
     demand = known.at(t)
     fake_kw, fake_kvar = _fake_load(site, scenario, t)
     told = zip(demand.p_kw + fake_kw, demand.q_kvar + fake_kvar, strict=True)
-    for sample, snapshot, (p_kw, q_kvar) in zip(samples, snapshots(samples), told, strict=True):
+    for sample, snapshot, (p_kw, q_kvar) in zip(
+        samples, received(list(snapshots(samples))), told, strict=True
+    ):
         frame = to_frame(site, snapshot)
         if trial.load_error is not None:
             read = np.isfinite(snapshot.p_kw)

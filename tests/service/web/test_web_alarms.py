@@ -294,7 +294,7 @@ def test_an_alarm_that_overtakes_the_list_stays(site: Site) -> None:
     page = site.open()
     expect(page.locator("#alarm-none")).to_be_visible()
     held: list[tuple[Route, APIResponse]] = []
-    page.route(LIST, lambda route: held.append((route, route.fetch())))
+    page.route(LIST, lambda route: held.append((route, route.fetch())), times=1)
     page.select_option("#alarm-kind", "meter-manipulated")
     while not held:
         page.wait_for_timeout(20)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from benchmarks.accusations import Run, cell, run
+from benchmarks._scenes import CLOCK_S, LATE_S, USUAL, Model, Setting, received
+from benchmarks.accusations import Run, cell, cells, run
+from feeders.model.site import Snapshot
 
 # Seeds with an honest meter accused before its mend come first.
 RUNS = [
@@ -39,3 +42,33 @@ def test_a_run_is_its_situation_and_seed() -> None:
     assert one.cell.endswith(f"{size:g}")
     assert len(one.manipulated) == 4
     assert sum(one.decisions.values()) == 90
+
+
+@pytest.mark.parametrize("model", [Model.LATE, Model.CLOCKS])
+def test_readings_of_other_moments(model: Model) -> None:
+    """Oracle: readings that are their own tick. Late powers tell their age; clocks move both alike."""
+    count, first = 200, 80
+    ticks = [
+        Snapshot(float(k), np.full(9, float(k)), np.full(9, k + 0.5), np.full(9, k + 0.25), 230.0)
+        for k in range(count)
+    ]
+    one = list(received(Setting("cigre-lv", model, learned=False, seed=3), ticks))[first]
+    assert one.t == first
+    assert (one.q_kvar == one.p_kw - 0.25).all()
+    behind = one.t - one.p_kw + 0.5
+    if model is Model.LATE:
+        assert (behind == LATE_S).all()
+        assert (one.p_age_s == LATE_S).all()
+        assert (one.v_volt == first).all()
+    else:
+        assert (one.v_volt == one.p_kw - 0.5).all()
+        assert one.p_age_s is None
+        assert set(behind) <= set(range(-CLOCK_S, CLOCK_S + 1))
+        assert len(set(behind)) > 2
+
+
+def test_a_further_model_takes_the_place_of_all() -> None:
+    """The usual models are filters, and leave the runs as they are."""
+    assert {each[1] for each in cells("drift", model=Model.SILENT)} == {Model.SILENT}
+    assert cells("drift", model=Model.LOADS) == cells("drift")
+    assert {each[1] for each in cells("drift")} == set(USUAL)
