@@ -4,6 +4,7 @@
     init(core, t) -> CoreState
     step(core, state, t, m, seen) -> (CoreState, Evidence)      every tick, releases masked meters
     identify(core, state, evidence) -> Suspicion                where `alarmed`
+    transition(core, state, suspicion) -> CoreState             where no explanation fits
     mask(core, state, suspicion) -> (CoreState, Evidence)       where meters are named
     adopt(core, state, suspicion) -> CoreState                  where loads alone explain the readings
     estimate(core, state, suspicion) -> Estimated               where asked for
@@ -444,6 +445,8 @@ def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
     if not suspicion.fits or found.chosen[0, :p].any() or doubted(found, p) >= ADOPTED or not state.rivals:
         return state
     rival = state.rivals[int(found.model[0])]
+    if rival.transition:
+        return state
     after, chosen = rival.filter, found.chosen[0]
     if chosen.any():
         whole = after.full or full.expanded(rival.modes, after, rival.static)
@@ -578,6 +581,31 @@ def _aligned(core: Core, found: Identification) -> bool:
     alike = classes.common(problem.y[first:], problem.F[first:, first:], most)
     gain = float(problem.y[chosen] @ mean_amounts(problem, chosen))
     return gain - alike < 2.0 * (core.limit + log(core.modes.size))
+
+
+def transition(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
+    """Add a rival with a transition since the onset, where no explanation fits and it is the likeliest one.
+
+    An earlier one is replaced. The state is unchanged where another model is likelier.
+
+    Parameters
+    ----------
+    core, state
+        The core, and the state after a tick.
+    suspicion
+        The explanations after the same tick.
+    """
+    if suspicion.fits or not state.rivals:
+        return state
+
+    def cost_of(rival: Rival) -> float:
+        return _misfit(core, rival.joint()) - 2.0 * rival.evidence
+
+    found = rivals.transitions(core.modes, state.history, state.detector.onsets, suspicion.row)
+    best = min((*state.rivals, *found), key=cost_of)
+    if not any(best is each for each in found):
+        return state
+    return replace(state, rivals=(*(each for each in state.rivals if not each.transition), best))
 
 
 def _keeping(found: Identification) -> Bools:

@@ -369,6 +369,10 @@ def _identified(
         return replace(state, suspicion=suspicion), evidence
     masked = state.core.masked.meters
     suspicion = core.identify(kernel, state.core, evidence, suspicion)
+    with_transition = core.transition(kernel, state.core, suspicion)
+    if with_transition is not state.core:
+        state = replace(state, core=with_transition)
+        suspicion = core.identify(kernel, state.core, evidence, suspicion)
     named = suspicion.found.named & ~masked
     streak = np.where(suspicion.found.chosen[0, : named.size], state.streak + 1, 0)
     certain = verdict.certain_phases(kernel, suspicion) & suspicion.fits
@@ -383,7 +387,10 @@ def _identified(
         state, suspicion=suspicion, streak=streak, phases=phases, inverters=inverters, due=tick + wait
     )
     since = () if any_of(masked) else state.core.history.readings[-age:]
-    sure = confirmed(suspicion.found, named, streak, since)
+    sure, best = confirmed(suspicion.found, named, streak, since), suspicion.found.chosen[0]
+    if suspicion.fits and not any_of(best[masked.size :]) and not any_of(best[: masked.size] & ~masked):
+        # Masked meters alone, which were manipulated before they were masked.
+        sure = best[: masked.size]
     if any_of(sure):
         found = replace(suspicion.found, named=sure)
         now, evidence = core.mask(kernel, state.core, replace(suspicion, found=found))

@@ -18,6 +18,11 @@ times the evidence. Under a rival a fault counts only as far as no loads imitate
 With constant amounts theta of the directions, ``nu_t`` and ``V_t`` of a mode are those without theta, and the
 evidence has the term ``(theta' N^-1 theta - log det N^-1) / 2``, that at the start subtracted.
 
+**Transition.** Manipulations may begin one after another, as by clocks that are off, or grow over some ticks.
+No explanation since one onset fits that. A further rival is the model itself with an own unknown amount of
+every reading, N(0, `APART`^2), at each of the first ticks since the onset. Its evidence, with faults of all
+members since, decides on their number, and on the rival as such.
+
 References
 ----------
 Ghahramani and Hinton, Variational learning for switching state-space models, Neural Computation 12, 2000.
@@ -53,6 +58,8 @@ The variances are those times `WITHIN_S` over the correlation time, between its 
 """
 RECENT = 8.0
 """Memory of the share of ticks with a jump, ticks."""
+APART = 0.05
+"""Standard deviation of a reading within a transition, squared pu: manipulations of several percent."""
 RATE = 1.0 / 60.0
 """Prior probability of a jump of each size, per tick: kettles and cars of a street."""
 
@@ -72,6 +79,8 @@ class Rival:
         the filter is modal, without theta.
     known
         Part of theta in the evidence that is subtracted: that before the first reading.
+    volume
+        ``log |det U|``, added at each tick in the modes: likelihoods are those of the meters' readings.
     onsets, suspected
         The onset, in row 0, in the modes, and its exact scores where readings have been missing.
     jumps
@@ -85,6 +94,8 @@ class Rival:
         The filter's last step.
     loads
         Variance of the loads' errors that vary, without any reading, in those of the model, 1.
+    transition
+        First ticks since the onset at which every reading is unknown.
     """
 
     modes: Modes
@@ -92,6 +103,7 @@ class Rival:
     static: Static
     sum: float
     known: float
+    volume: float
     onsets: Onsets
     suspected: Suspected | None
     jumps: int | None
@@ -101,6 +113,7 @@ class Rival:
     ticks: int = 0
     update: Update | None = None
     loads: float = 1.0
+    transition: int = 0
 
     @property
     def unrest(self) -> float:
@@ -144,9 +157,9 @@ def first(modes: Modes, others: Sequence[Modes], history: History) -> list[Rival
         The readings.
     """
     state, known, *_ = history.start
-    none = signatures.empty(modes, 1)
+    none, volume = signatures.empty(modes, 1), float(np.linalg.slogdet(modes.U)[1])
     return [
-        Rival(each, state, known, 0.0, _of_theta(each, known), none, None, 0 if k else None)
+        Rival(each, state, known, 0.0, _of_theta(each, known), volume, none, None, 0 if k else None)
         for k, each in enumerate((modes, *others))
     ]
 
@@ -165,7 +178,31 @@ def replayed(
     onsets, row
         The onsets of the detector after the last reading, and the row of the onset.
     """
-    state, _, test, suspected = history.start
+    return _replayed(first(modes, others, history), history, onsets, row)
+
+
+def transitions(modes: Modes, history: History, onsets: Onsets, row: int) -> tuple[Rival, ...]:
+    """The model itself with transitions of 1, 2, 4, ... ticks, shorter than the onset's age.
+
+    None for an onset before the kept readings.
+
+    Parameters
+    ----------
+    modes, history, onsets, row
+        As in `replayed`.
+    """
+    age, (plain,) = int(onsets.age[row]), first(modes, (), history)
+    if age > len(history.readings):
+        return ()
+    spans = 1 << np.arange((age - 1).bit_length())
+    return _replayed([replace(plain, transition=int(span)) for span in spans], history, onsets, row)
+
+
+def _replayed(before: list[Rival], history: History, onsets: Onsets, row: int) -> tuple[Rival, ...]:
+    """Rivals after the last reading, with the scores of one onset, from those before the first one."""
+    if not before:
+        return ()
+    modes, (state, _, test, suspected) = before[0].modes, history.start
     count, age, had = len(history.readings), int(onsets.age[row]), detector.followed(modes, test).onsets
     older = bool(had.used[row]) and int(had.age[row]) == age - count
     exactly = next((each for each in suspected if older and each.row == row), None)
@@ -173,9 +210,21 @@ def replayed(
     one = signatures.empty(modes, int(not onsets.ramp[row]), int(onsets.ramp[row]))
     if older and (state.full is None or exactly is not None):
         begin, one = -1, signatures.single(had, row)
-    out = [replace(each, onsets=one, suspected=exactly) for each in first(modes, others, history)]
+    out, apart = [replace(each, onsets=one, suspected=exactly) for each in before], APART * np.eye(modes.size)
     for k, (t, m, seen, unknown, jump) in enumerate(history.readings):
-        out = [follow(each, t, m, seen, unknown, jump, begun=k == begin) for each in out]
+        within = apart if unknown is None else np.hstack([unknown, apart])
+        out = [
+            follow(
+                each,
+                t,
+                m,
+                seen,
+                within if begin <= k < begin + each.transition else unknown,
+                jump,
+                begun=k == begin,
+            )
+            for each in out
+        ]
     return tuple(out)
 
 
@@ -222,6 +271,7 @@ def follow(  # noqa: PLR0917  # the state, and one tick
     if update.exact is None:
         count = modes.size
         total -= 0.5 * float((update.innovation**2 / update.variance + np.log(update.variance)).sum())
+        total += before.volume
         if begun or onsets.used[0]:
             onsets = signatures.follow(modes, onsets, update, known, gap.h, begun=[0] if begun else [])
     else:

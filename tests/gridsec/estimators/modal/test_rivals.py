@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks._residuals import Dense, Source, power_columns, tree
-from gridsec.estimators.modal import core, rivals, signatures
+from gridsec.estimators.modal import core, detector, rivals, signatures
 from gridsec.estimators.modal.rivals import RATE, UNREST
 from tests.gridsec.estimators.modal.test_core import LIAR, MODEL
 from tests.gridsec.estimators.modal.test_detector import busbar
@@ -47,8 +47,6 @@ def test_evidence_and_scores_equal_those_of_the_dense_filter(make: object, kind:
         jumped = mine.jumps != before.jumps
         exact += np.log(RATE if jumped else 1.0 - 2.0 * RATE)
         exact -= 0.5 * float(nu @ np.linalg.solve(V, nu) + np.linalg.slogdet(V)[1])
-        if before.filter.full is None and seen[k].all():
-            exact -= float(np.linalg.slogdet(made.U)[1])
     assert mine.jumps
     first = rivals.first(kernel.modes, kernel.rivals, core.init(kernel, 0.0).history)[1 + unrest]
     start = 0.5 * float(np.linalg.slogdet(np.diag(made.sign))[1]) if made.sign.size else 0.0
@@ -73,6 +71,67 @@ def test_the_first_of_the_rivals_is_the_model() -> None:
     now = mine.joint()
     assert np.allclose(now.score, other.score, atol=1e-8 * np.abs(other.score).max())
     assert np.allclose(now.information, other.information, atol=1e-8 * np.abs(other.information).max())
+
+
+@pytest.mark.parametrize("missing", [False, True])
+def test_transitions_equal_the_dense_filter(missing: bool) -> None:
+    """Every reading has an own unknown amount at the first 1, 2 and 4 ticks since an onset 7 ticks ago."""
+    kernel, p, ticks, age = core.assemble(MODEL, np.zeros((13, 12)), np.ones(12), gamma=1e6), 12, 40, 7
+    seen = np.arange(p) < p - missing
+    readings, state = Source(MODEL, np.random.default_rng(5)).ticks(ticks), core.init(kernel, 0.0)
+    for k, m in enumerate(readings):
+        state, _ = core.step(kernel, state, float(k), m, seen)
+    onsets = detector.followed(kernel.modes, state.detector).onsets
+    row = int(np.flatnonzero((onsets.age == age) & ~onsets.ramp & onsets.used)[0])
+    found = rivals.transitions(kernel.modes, state.history, onsets, row)
+    assert [each.transition for each in found] == [1, 2, 4]
+    for mine in found:
+        dense, without, exact = Dense(MODEL, np.eye(p), 1.0), Dense(MODEL), 0.0
+        for k, m in enumerate(readings):
+            since = k - (ticks - age)
+            for each in (dense, without):
+                each.D = MODEL.noise(np.arange(p))
+                if 0 <= since < mine.transition:
+                    each.D = each.D + rivals.APART**2 * np.eye(p)
+                nu, V = each.step(1.0 if k else 0.0, m, seen, level=float(since >= 0))
+            exact -= 0.5 * float(nu @ np.linalg.solve(V, nu) + np.linalg.slogdet(V)[1])
+        sign = kernel.modes.sign
+        start = 0.5 * float(np.linalg.slogdet(np.diag(sign))[1]) if sign.size else 0.0
+        assert mine.evidence == pytest.approx(exact + start, abs=1e-5)
+        now = mine.joint()
+        information = kernel.modes.U @ now.information @ kernel.modes.U.T
+        inverse = np.linalg.inv(dense.cov[3 * p :, 3 * p :])
+        assert np.allclose(inverse, np.eye(p) + information, rtol=1e-5, atol=1e-3)
+    # An onset before the kept readings has none.
+    assert not rivals.transitions(kernel.modes, core.init(kernel, 0.0).history, onsets, row)
+
+
+def test_manipulations_that_begin_one_after_another() -> None:
+    """Four meters, one more at each tick: one onset explains nothing, and with a transition all are found."""
+    kernel = core.assemble(MODEL, STEPS_OF_PLACES, np.full(12, 0.1), gamma=1e6)
+    source, state, liars = (
+        Source(MODEL, np.random.default_rng(1)),
+        core.init(kernel, 0.0),
+        np.arange(12) % 3 == 1,
+    )
+    alone = []
+    for k in range(212):
+        begun = np.cumsum(liars) <= k - 199
+        m = source.tick() + 0.06 * (liars & begun)
+        state, evidence = core.step(kernel, state, float(k), m)
+        if k >= 206:
+            suspicion = core.identify(kernel, state, evidence)
+            alone.append(suspicion.fits)
+            after = core.transition(kernel, state, suspicion)
+            if after is not state:
+                state, suspicion = after, core.identify(kernel, after, evidence)
+            assert suspicion.fits
+            assert (suspicion.found.named == liars).all()
+    assert not alone[0]
+    # The rival with the transition is followed.
+    assert all(alone[1:])
+    assert sum(each.transition > 0 for each in state.rivals) == 1
+    assert core.adopt(kernel, state, suspicion) is state
 
 
 STEPS_OF_PLACES = np.vstack([np.zeros((1, 12)), STEPS])
