@@ -56,9 +56,9 @@ from math import inf, log
 from typing import Self
 
 import numpy as np
-from scipy.optimize import minimize
 
 from gridsec.arrays import Bools, Floats, Ints, any_of, submatrix
+from gridsec.estimators.modal.alike import HALF, bounded_minimum
 from gridsec.estimators.modal.costs import (
     SearchProblem,
     Tableau,
@@ -79,16 +79,12 @@ ROUNDS, WORTH = 4, 1.0
 """Largest number of amounts for which the relaxation is solved, and least gain of the cost by one more, 1."""
 LARGER = 1.5
 """Next amount over the largest one tried where the relaxation has more meters than are promised, 1."""
-ITERATIONS = 300
-"""Largest number of iterations of the relaxation; most take below 100."""
 _LEAST = -2.0 * log(DOUBT)
 """Difference of L below which a set contests a name in any case, 1: the limit of a naming."""
 _COUNTS = -2.0 * log(2.0 * DOUBT)
 """Largest cost of a set that contests a name: twice the weight from which on a set counts in the variance."""
 ALIKE_LESS = 3.0
 """Amount by which L with amounts alike may be below the bound of independent ones, 1: 2 log 2, and more."""
-HALF = 0.5
-"""Share from which on a meter is in the set of the relaxation, and at its start, 1."""
 
 
 def weighed(found: Identification, masked: Bools, near: Neighbourhoods) -> Identification:
@@ -429,7 +425,7 @@ class _Relaxed:
 
         The bound holds to the tolerance of the solver.
         """
-        z = _nonnegative(self.F, self.y, np.zeros(self.y.size), inf)
+        z = bounded_minimum(self.F, self.y, np.zeros(self.y.size), inf)
         order = np.argsort(-z, kind="stable")
         inside = np.zeros(z.size, dtype=np.bool_)
         inside[order[np.cumsum(self.counted[order]) <= self.room]] = True
@@ -437,18 +433,4 @@ class _Relaxed:
 
     def _share(self, amount: float, start: Floats) -> Floats:
         """Solution of the relaxation, (k,)."""
-        return _nonnegative(amount * amount * self.F, amount * self.y, start, 1.0)
-
-
-def _nonnegative(F: Floats, y: Floats, start: Floats, most: float) -> Floats:
-    """Minimum of ``z' F z / 2 - z' y`` over 0 <= z <= most, (k,)."""
-
-    def cost(z: Floats) -> tuple[float, Floats]:
-        rows = F @ z
-        return float(0.5 * (z @ rows) - y @ z), rows - y
-
-    if not y.size:
-        return start
-    bounds = [(0.0, most)] * y.size
-    found = minimize(cost, start, jac=True, bounds=bounds, method="L-BFGS-B", options={"maxiter": ITERATIONS})
-    return np.asarray(found.x)
+        return bounded_minimum(amount * amount * self.F, amount * self.y, start)

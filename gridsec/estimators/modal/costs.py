@@ -24,6 +24,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import inf, log
+from typing import Self
 
 import numpy as np
 from scipy.linalg import blas, cho_solve, cholesky, lapack
@@ -187,28 +188,32 @@ def padded(sets: Bools) -> tuple[Ints, Bools]:
 
 
 def _fits(A: Floats, v: Floats) -> tuple[Floats, Floats]:
-    """``log det A`` and ``v' A^-1 v`` of leading blocks of stacked definite matrices, (k, n) each."""
-    # The last row of the Cholesky factor of [A, v; v', c] is (half^-1 v)', for any c that is large enough.
-    k, n = v.shape
-    bordered = np.empty((k, n + 1, n + 1))
-    bordered[:, :n, :n] = A
-    bordered[:, n, :n] = bordered[:, :n, n] = v
-    bordered[:, n, n] = _HUGE
-    half = np.linalg.cholesky(bordered)
-    white, diagonal = half[:, n, :n], np.einsum("kii->ki", half)[:, :n]
-    return 2.0 * np.cumsum(np.log(diagonal), axis=1), np.cumsum(white * white, axis=1)
+    """``log det A`` (k, n) and ``v A^-1 v'`` (k, r, r, n) of leading blocks of stacked definite matrices.
+
+    v: (k, r, n) rows; the products of two rows are those of their beginnings.
+    """
+    # The last rows of the Cholesky factor of [A, v'; v, c] are (half^-1 v')', for any c that is large enough.
+    half = _bordered(A, v)
+    n = v.shape[2]
+    white, diagonal = half[:, n:, :n], np.einsum("kii->ki", half)[:, :n]
+    return 2.0 * np.cumsum(np.log(diagonal), axis=1), np.cumsum(white[:, :, None] * white[:, None], axis=3)
 
 
 def _inner(A: Floats, v: Floats) -> tuple[Floats, Floats]:
     """``log det A`` (k,) and ``v A^-1 v'`` (k, r, r) of stacked definite matrices and rows v (k, r, n)."""
+    half, n = _bordered(A, v), v.shape[2]
+    white, diagonal = half[:, n:, :n], np.einsum("kii->ki", half)[:, :n]
+    return 2.0 * np.log(diagonal).sum(axis=1), white @ white.transpose(0, 2, 1)
+
+
+def _bordered(A: Floats, v: Floats) -> Floats:
+    """Cholesky factors of stacked definite matrices with rows v (k, r, n) below them, (k, n + r, n + r)."""
     k, r, n = v.shape
     bordered = np.empty((k, n + r, n + r))
     bordered[:, :n, :n] = A
     bordered[:, n:, :n], bordered[:, :n, n:] = v, v.transpose(0, 2, 1)
     bordered[:, n:, n:] = _HUGE * np.eye(r)
-    half = np.linalg.cholesky(bordered)
-    white, diagonal = half[:, n:, :n], np.einsum("kii->ki", half)[:, :n]
-    return 2.0 * np.log(diagonal).sum(axis=1), white @ white.transpose(0, 2, 1)
+    return np.linalg.cholesky(bordered)
 
 
 _HUGE = 1e200
@@ -262,7 +267,7 @@ class Tableau:
         self.cost = 0.0
         self.size = 2.0 * np.log(problem.std)
 
-    def pivot(self, chosen: Bools) -> Tableau:
+    def pivot(self, chosen: Bools) -> Self:
         """The same, pivoted on a set in place of none; O(q^2 k).
 
         Parameters
@@ -287,32 +292,47 @@ class Tableau:
         self.cost += float(self.penalty[self.count])
         return self
 
-    def copy(self) -> Tableau:
+    def copy(self) -> Self:
         """A tableau that can be changed without changing this one."""
-        out = object.__new__(Tableau)
+        out = object.__new__(type(self))
         out.problem, out.penalty, out.size = self.problem, self.penalty, self.size
         out.A, out.chosen, out.cost = self.A.copy(order="F"), self.chosen.copy(), self.cost
         out.barred = self.barred.copy()
         return out
 
     @property
+    def whole(self) -> float:
+        """Cost of the set, with all that the amounts have in common."""
+        return self.cost
+
+    @property
     def count(self) -> int:
         """Number of chosen meters."""
         return int(np.count_nonzero(self.chosen[: self.problem.meters]))
 
+    @property
+    def amount(self) -> Floats:
+        """Posterior means of the amounts of chosen faults, (q,); not defined for others."""
+        return self.A[:-1, -1]
+
     def changes(self) -> Floats:
         """Change of the cost by toggling each fault, (q,); inf where it is barred or would be impossible."""
-        q, k = self.chosen.size, self.count
+        a = self.A.diagonal()[: self.chosen.size]
+        out, v = self.steps()
+        impossible = ~self.chosen & (np.abs(v) > self.problem.bound * np.abs(a))
+        sign = np.where(self.chosen, -1.0, 1.0)
+        return np.where(impossible | (self.barred & ~self.chosen) | (sign * a <= 0.0), inf, out)
+
+    def steps(self) -> tuple[Floats, Floats]:
+        """Change of the cost by toggling each fault, and its amount times its pivot, (q,)."""
+        q, k, p = self.chosen.size, self.count, self.problem.meters
         a, v = self.A.diagonal()[:q], self.A[:q, q]
         sign = np.where(self.chosen, -1.0, 1.0)
         out = -v * v / a + np.where(self.chosen, np.log(np.abs(a)) - self.size, np.log(np.abs(a)) + self.size)
-        p = self.problem.meters
         up = self.penalty[min(k + 1, p)] - self.penalty[k]
         down = self.penalty[max(k - 1, 0)] - self.penalty[k]
         out[:p] += np.where(self.chosen[:p], down, up)
-        out += sign * self.problem.charge
-        impossible = ~self.chosen & (np.abs(v) > self.problem.bound * np.abs(a))
-        return np.where(impossible | (self.barred & ~self.chosen) | (sign * a <= 0.0), inf, out)
+        return out + sign * self.problem.charge, v
 
     def exchanges(self, out: Ints) -> Floats:
         """Change of the cost by exchanging chosen faults `out` for others, (k, q); inf for itself.
@@ -322,19 +342,24 @@ class Tableau:
         out : (k,)
             Chosen faults.
         """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            both, pull, pivot = self.pairs(out)
+            impossible = np.abs(pull) > self.problem.bound * np.abs(pivot)
+        return np.where(self.chosen | self.barred | impossible | ~(pivot > 0.0), inf, both)
+
+    def pairs(self, out: Ints) -> tuple[Floats, Floats, Floats]:
+        """Change of the cost by exchanges, the amount of the new one times its pivot, and that, (k, q)."""
         p, q, k = self.problem.meters, self.chosen.size, self.count
         a, v = self.A.diagonal()[:q], self.A[:q, q]
         rows = self.A[out, :q] / a[out][:, None]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            pivot = a - rows * self.A[out, :q]
-            pull = v - rows * v[out][:, None]
-            first = -(v[out] ** 2) / a[out] + np.log(-a[out]) - self.size[out] - self.problem.charge[out]
-            both = first[:, None] - pull**2 / pivot + np.log(pivot) + self.size + self.problem.charge
-            impossible = np.abs(pull) > self.problem.bound * np.abs(pivot)
+        pivot = a - rows * self.A[out, :q]
+        pull = v - rows * v[out][:, None]
+        first = -(v[out] ** 2) / a[out] + np.log(-a[out]) - self.size[out] - self.problem.charge[out]
+        both = first[:, None] - pull**2 / pivot + np.log(pivot) + self.size + self.problem.charge
         meter = np.arange(q) < p
         count = k - meter[out][:, None] + meter
         both += self.penalty[np.minimum(count, p)] - self.penalty[k]
-        return np.where(self.chosen | self.barred | impossible | ~(pivot > 0.0), inf, both)
+        return both, pull, pivot
 
     def toggled(self, members: Ints, inside: Bools) -> Floats:
         """Change of the cost by toggling sets of meters, (k,).
@@ -397,14 +422,25 @@ class Tableau:
         members, inside : (k, g)
             The sequences, filled up to the same length, and where they are members.
         """
-        q, p = self.chosen.size, self.problem.meters
-        free = inside & ~self.chosen[members]
-        count, k = np.cumsum(free, axis=1), self.count
+        return self.beginnings(members, inside, self.A[None, :-1, -1])[0]
+
+    def beginnings(self, members: Ints, inside: Bools, rows: Floats) -> tuple[Floats, Bools, Floats]:
+        """The same, new members (k, g), and the products of rows (r, q) over the new members, (k, r, r, g).
+
+        Parameters
+        ----------
+        members, inside : (k, g)
+            The sequences.
+        rows : (r, q)
+            The scores, and other rows beside the tableau.
+        """
+        p, free, k = self.problem.meters, inside & ~self.chosen[members], self.count
+        count = np.cumsum(free, axis=1)
         both = free[:, :, None] & free[:, None, :]
         A = np.where(both, self.A[members[:, :, None], members[:, None, :]], 0.0)
         A[:, np.arange(members.shape[1]), np.arange(members.shape[1])] += ~free
-        log_det, fit = _fits(A, np.where(free, self.A[members, q], 0.0))
+        log_det, inner = _fits(A, rows[:, members].transpose(1, 0, 2) * free[:, None])
         size = np.cumsum(free * self.size[members], axis=1)
-        out = log_det + size - fit + self.penalty[np.minimum(k + count, p)] - self.penalty[k]
+        out = log_det + size - inner[:, 0, 0] + self.penalty[np.minimum(k + count, p)] - self.penalty[k]
         barred = np.logical_or.accumulate(free & self.barred[members], axis=1)
-        return np.where((count > 1) & ~barred, out, inf)
+        return np.where((count > 1) & ~barred, out, inf), free, inner

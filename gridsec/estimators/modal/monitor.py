@@ -17,14 +17,14 @@ The residual of a meter is its squared reading less the model; fixed errors are 
 Registers err in proportion to v2: with b at 1 pu, ``b (v2 - 1)`` by the mean of b before the tick is no part
 of the residual. A meter is named when a search names it and `CONFIRM` searches in turn have it in their
 likeliest explanations, when one search names it as the only fault with `CONFIRM` readings since the onset,
-or when it repeats its readings beyond chance. An explanation is named whole, or after `APART` ones. Named
+or when it repeats its readings beyond chance. Others of its explanation may delay it (`naming`). Named
 meters are masked from the onset on, and released by their readings (`masking`). The busbar's meter is named
 by searches in turn. Its phase then counts as not metered, until both agree.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -36,9 +36,9 @@ from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.doubts import Movements, Unknown
 from gridsec.estimators.modal.estimate import Reconstructed, Spread
+from gridsec.estimators.modal.naming import CONFIRM, final
 from gridsec.estimators.modal.record import Record
-from gridsec.estimators.modal.replay import Reading
-from gridsec.estimators.modal.search import DOUBT, Identification
+from gridsec.estimators.modal.search import DOUBT
 from gridsec.estimators.plant import Plant, nothing_new
 from gridsec.estimators.sequential import design as front_design
 from gridsec.estimators.sequential import init as front_init
@@ -85,13 +85,6 @@ from gridsec.estimators.sequential.state import (
 from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.certificates import Certificate
 
-CONFIRM = 2
-"""Searches in turn that accuse a fault before it is named. Least readings of a meter that one search names.
-
-One reading may be an outlier, and the first explanation of several faults a part of them.
-"""
-APART = 2 * CONFIRM
-"""Searches in turn after which a meter is named beside others that are not confirmed yet."""
 LOOKS = 16
 """Searches per age of the suspected onset: explanations change ever more slowly."""
 SETTLING = 32
@@ -387,10 +380,11 @@ def _identified(
         state, suspicion=suspicion, streak=streak, phases=phases, inverters=inverters, due=tick + wait
     )
     since = () if any_of(masked) else state.core.history.readings[-age:]
-    sure, best = confirmed(suspicion.found, named, streak, since), suspicion.found.chosen[0]
-    if suspicion.fits and not any_of(best[masked.size :]) and not any_of(best[: masked.size] & ~masked):
+    sure = final(suspicion.found, named, streak, since, kernel.near.laterals)
+    best = np.flatnonzero(suspicion.found.chosen[0])
+    if suspicion.fits and np.isin(best, np.flatnonzero(masked)).all():
         # Masked meters alone, which were manipulated before they were masked.
-        sure = best[: masked.size]
+        sure = masked & suspicion.found.chosen[0, : masked.size]
     if any_of(sure):
         found = replace(suspicion.found, named=sure)
         now, evidence = core.mask(kernel, state.core, replace(suspicion, found=found))
@@ -404,30 +398,6 @@ def _identified(
         if adopted is not state.core:
             return replace(after, core=adopted, suspicion=None), evidence
     return after, evidence
-
-
-def confirmed(found: Identification, named: Bools, streak: Ints, since: Sequence[Reading]) -> Bools:
-    """Meters that a search names finally, (p,).
-
-    Parameters
-    ----------
-    found
-        What it found.
-    named : (p,)
-        Meters that it names newly.
-    streak : (p,)
-        Searches in turn with each in the likeliest explanation.
-    since
-        Ticks since the suspected onset; none where meters are masked, and may collude with others.
-    """
-    sole = np.flatnonzero(named)
-    if sole.size == 1 and np.count_nonzero(found.chosen[0]) == 1:
-        readings = sum(seen is None or bool(seen[sole[0]]) for _, _, seen, *_ in since)
-        if readings >= CONFIRM:
-            return named
-    # Without a part of the meters, other faults may explain the rest: a few more searches may name all.
-    least = CONFIRM if all_of(streak[named] >= CONFIRM) else APART
-    return np.asarray(named & (streak >= least))
 
 
 def _unsuspected(state: ModalState) -> ModalState:

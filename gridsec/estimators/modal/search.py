@@ -28,11 +28,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf, log
+from typing import TypeVar
 
 import numpy as np
 from scipy.linalg import cho_solve, lapack
 
 from gridsec.arrays import Bools, Floats, Ints
+from gridsec.estimators.modal.alike import Alike
 from gridsec.estimators.modal.costs import (
     BELIEVED,
     SearchProblem,
@@ -44,6 +46,8 @@ from gridsec.estimators.modal.costs import (
     mean_likelihood,
 )
 from gridsec.estimators.modal.laterals import GAIN, Groups, excess, filled, in_common, similar, together
+
+AnyTableau = TypeVar("AnyTableau", bound=Tableau)
 
 DOUBT = 1e-3
 """Largest weight of all explanations without a meter that is named, 1."""
@@ -94,7 +98,7 @@ class Identification:
     problems: tuple[SearchProblem, ...]
 
 
-def descend(tableau: Tableau, groups: Groups = (), met: set[bytes] | None = None) -> Tableau:
+def descend(tableau: AnyTableau, groups: Groups = (), met: set[bytes] | None = None) -> AnyTableau:
     """Lower the cost by additions, removals, exchanges and groups until none of them helps.
 
     A fault with an amount that other changes have made impossible is removed and barred.
@@ -125,8 +129,7 @@ def descend(tableau: Tableau, groups: Groups = (), met: set[bytes] | None = None
 
 def _possible(tableau: Tableau) -> bool:
     """Bar the faults with impossible amounts, if there are any."""
-    amount = tableau.A[:-1, -1]
-    beyond = np.flatnonzero(tableau.chosen & (np.abs(amount) > tableau.problem.bound))
+    beyond = np.flatnonzero(tableau.chosen & (np.abs(tableau.amount) > tableau.problem.bound))
     for j in beyond:
         tableau.bar(int(j))
     return bool(beyond.size)
@@ -214,7 +217,9 @@ def search(
     ends = [_descended(problem, (np.zeros_like(start), start), batches)]
     for other, _ in rivals:
         ends.append(_descended(other, (np.zeros_like(start), ends[0].chosen), batches))
-    one_amount = [in_common(end.problem, whole, end.chosen) for end in ends]
+    one_amount = [
+        np.vstack([in_common(end.problem, whole, end.chosen), _nearly_alike(end, batches)]) for end in ends
+    ]
     more = (0.0, *(cost for _, cost in rivals))
     least = [
         min(end.cost, float((costs(end.problem, sets, ALIKE) - excess(sets, whole, read)).min(initial=inf)))
@@ -287,6 +292,54 @@ def _explored(
             _neighbours(_at(problem, np.frombuffer(key, dtype=np.bool_)), found, UNLIKELY)
     _with_amounts_alike(problem, found, one_amount)
     return found
+
+
+def _nearly_alike(best: Tableau, groups: Groups) -> Bools:
+    """Ends of descents with amounts alike, sets beside them, and those without each meter, (k, q).
+
+    The descents start with the best set, and without faults other than meters: with its meters, and with
+    the relaxations of one prior standard deviation. Powers explain a part of a group, and no step beside
+    them is worth its penalty then. The best end is continued from its relaxation.
+
+    Parameters
+    ----------
+    best
+        The best set with independent amounts.
+    groups
+        Groups of neighbours.
+    """
+    problem, meter = best.problem, np.arange(best.chosen.size) < best.problem.meters
+    met = set[bytes]()
+
+    def end(start: Bools, barred: Bools) -> Alike:
+        tableau = Alike(problem, ALIKE).pivot(start)
+        tableau.barred = barred.copy()
+        return descend(tableau, groups, met)
+
+    nothing = Alike(problem, ALIKE)
+    starts = _different((best.chosen & meter, nothing.relaxed(1.0), nothing.relaxed(-1.0)))
+    ends = [end(start, ~meter) for start in starts]
+    if best.chosen[~meter].any():
+        ends.append(end(best.chosen, np.zeros_like(meter)))
+    least = min(ends, key=lambda each: each.whole)
+    more = end(least.relaxed(), least.barred)
+    return _beside_alike(min(least, more, key=lambda each: each.whole), groups)
+
+
+def _beside_alike(end: Alike, groups: Groups) -> Bools:
+    """A set with amounts alike, those beside it, and those that descents find without each meter, (k, q)."""
+    end.barred[:] = False
+    limit = end.whole - 2.0 * log(UNLIKELY)
+    found = {end.chosen.tobytes(): end.whole}
+    _neighbours(end, found, UNLIKELY)
+    for j in np.flatnonzero(end.chosen[: end.problem.meters]):
+        rival = end.copy()
+        rival.bar(int(j))
+        if rival.whole + min(0.0, float(rival.changes().min())) < limit:
+            descend(rival, groups)
+            found.setdefault(rival.chosen.tobytes(), rival.whole)
+    keys = sorted(found, key=lambda key: found[key])[:SOME]
+    return np.stack([np.frombuffer(key, dtype=np.bool_) for key in keys])
 
 
 def _with_amounts_alike(problem: SearchProblem, found: dict[bytes, float], more: Bools) -> None:
@@ -390,19 +443,19 @@ _FLIPS = 4
 def _neighbours(best: Tableau, found: dict[bytes, float], least: float = BELIEVED) -> None:
     """Add the sets that differ from the best by one addition, removal or exchange, if they weigh anything."""
     limit = min(found.values()) - 2.0 * log(least)
-    change = best.changes()
-    for j in np.flatnonzero(best.cost + change < limit):
+    whole, change = best.whole, best.changes()
+    for j in np.flatnonzero(whole + change < limit):
         chosen = best.chosen.copy()
         chosen[j] = not chosen[j]
-        found.setdefault(chosen.tobytes(), best.cost + float(change[j]))
+        found.setdefault(chosen.tobytes(), whole + float(change[j]))
     out = np.flatnonzero(best.chosen)
     if not out.size:
         return
     both = best.exchanges(out)
-    for i, j in zip(*np.nonzero(best.cost + both < limit), strict=True):
+    for i, j in zip(*np.nonzero(whole + both < limit), strict=True):
         chosen = best.chosen.copy()
         chosen[out[i]], chosen[j] = False, True
-        found.setdefault(chosen.tobytes(), best.cost + float(both[i, j]))
+        found.setdefault(chosen.tobytes(), whole + float(both[i, j]))
 
 
 def costs_of(found: Identification) -> list[dict[bytes, float]]:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from gridsec.arrays import Bools
-from gridsec.estimators.modal.monitor import APART, CONFIRM, confirmed, design, init, own_errors, step
+from gridsec.estimators.modal.monitor import design, init, own_errors, step
+from gridsec.estimators.modal.naming import APART, CONFIRM, confirmed
 from gridsec.estimators.modal.replay import Reading
 from gridsec.estimators.modal.search import Identification
 from gridsec.estimators.modal.verdict import combined

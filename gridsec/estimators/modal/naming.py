@@ -1,0 +1,141 @@
+"""Final names: meters that searches in turn accuse, masked together or where nothing depends on it.
+
+    final(found, named, streak, since, laterals) -> (p,)      meters to mask
+
+A search names the meters without which nothing explains the readings. One reading may be an outlier, and the
+first explanation of several faults a part of them: names need searches in turn, `confirmed`.
+
+**Parts of an explanation.** Masked meters have any amounts. With N the meters to mask, of the scores y and
+the information F of the others remain
+
+    y - F_N F_NN^-1 y_N,   F - F_N F_NN^-1 F_N'
+
+Amounts that the others have in common with those of N say nothing any more. False powers may then explain
+the rest at a lower cost than the meters that the likeliest explanation has, although the whole evidence is
+against such powers, or honest loads do. N is not masked where explanations with the rest of the meters of
+the likeliest one weigh at least `SURE`, and less than `KEEPS` in what remains. After `WHOLE` searches in turn
+N is masked in any case.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gridsec.arrays import Bools, Ints, all_of, any_of
+from gridsec.estimators.modal.costs import SearchProblem, informed
+from gridsec.estimators.modal.laterals import excess
+from gridsec.estimators.modal.replay import Reading
+from gridsec.estimators.modal.search import SOME, Identification, mixed
+
+CONFIRM = 2
+"""Searches in turn that accuse a fault before it is named. Least readings of a meter that one search names.
+
+One reading may be an outlier, and the first explanation of several faults a part of them.
+"""
+APART = 2 * CONFIRM
+"""Searches in turn after which a meter is named beside others that are not confirmed yet."""
+WHOLE = 8 * CONFIRM
+"""Searches in turn after which meters are masked even if others explain the rest without their readings."""
+SURE = 0.95
+"""Least weight of the rest of an explanation that its masked meters do not leave behind, 1."""
+KEEPS = 0.5
+"""Least weight of such a rest without the readings of the masked meters, 1: it stays likelier than not."""
+FLAT = 1e-6
+"""Prior information of the amounts of masked meters, in that of the prior, 1: rounding."""
+
+
+def final(
+    found: Identification, named: Bools, streak: Ints, since: Sequence[Reading], laterals: Bools
+) -> Bools:
+    """Meters to mask now, (p,).
+
+    Parameters
+    ----------
+    found, named, streak, since
+        As in `confirmed`.
+    laterals : (G, p)
+        Members of the laterals that may be manipulated as a whole.
+    """
+    sure = confirmed(found, named, streak, since)
+    if not any_of(sure) or streak[sure].max() >= WHOLE or separable(found, sure, laterals):
+        return sure
+    return np.zeros_like(sure)
+
+
+def confirmed(found: Identification, named: Bools, streak: Ints, since: Sequence[Reading]) -> Bools:
+    """Meters that a search names finally, (p,).
+
+    Parameters
+    ----------
+    found
+        What it found.
+    named : (p,)
+        Meters that it names newly.
+    streak : (p,)
+        Searches in turn with each in the likeliest explanation.
+    since
+        Ticks since the suspected onset; none where meters are masked, and may collude with others.
+    """
+    sole = np.flatnonzero(named)
+    if sole.size == 1 and np.count_nonzero(found.chosen[0]) == 1:
+        readings = sum(seen is None or bool(seen[sole[0]]) for _, _, seen, *_ in since)
+        if readings >= CONFIRM:
+            return named
+    # Without a part of the meters, other faults may explain the rest: a few more searches may name all.
+    least = CONFIRM if all_of(streak[named] >= CONFIRM) else APART
+    return np.asarray(named & (streak >= least))
+
+
+def separable(found: Identification, which: Bools, laterals: Bools) -> bool:
+    """The rest of the likeliest explanation is doubtful, or stays likely where some of its meters are masked.
+
+    Parameters
+    ----------
+    found
+        What a search found.
+    which : (p,)
+        Meters to mask.
+    laterals : (G, p)
+        Members of the laterals that may be manipulated as a whole.
+    """
+    p, model = which.size, int(found.model[0])
+    rest = found.chosen[0, :p] & ~which
+
+    def with_rest(sets: Bools) -> Bools:
+        return np.asarray((sets[:, :p] >= rest).all(axis=1))
+
+    if not any_of(rest) or found.weight[with_rest(found.chosen)].sum() < SURE:
+        return True
+    problem = without(found.problems[model], which)
+    sets = found.chosen[found.model == model].copy()
+    sets[:, :p] &= ~which
+    sets = np.array(list({each.tobytes(): each for each in sets}.values())[:SOME])
+    read = informed(problem)
+    costs = mixed(problem, sets) - excess(sets, (laterals & read).astype(np.float64), read)
+    weight = np.exp(-0.5 * (costs - costs.min()))
+    return bool(weight[with_rest(sets)].sum() >= KEEPS * weight.sum())
+
+
+def without(problem: SearchProblem, which: Bools) -> SearchProblem:
+    """The problem where some meters (p,) have any amounts: nothing is known of them.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    which : (p,)
+        The meters.
+    """
+    N, rest = np.flatnonzero(which), np.ones(problem.y.size, dtype=np.bool_)
+    rest[N] = False
+    F = problem.F[np.ix_(N, N)] + np.diag(FLAT * problem.std[N] ** -2.0)
+    known = np.linalg.solve(F, np.column_stack([problem.F[N], problem.y[N]]))
+    left = problem.F - problem.F[:, N] @ known[:, :-1]
+    return replace(
+        problem,
+        y=np.where(rest, problem.y - problem.F[:, N] @ known[:, -1], 0.0),
+        F=np.where(np.logical_and.outer(rest, rest), left, 0.0),
+    )
