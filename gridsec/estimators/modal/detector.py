@@ -39,13 +39,13 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from math import exp, gcd, inf, log, log1p, sqrt
 
 import numpy as np
 from scipy.linalg import lapack
 
-from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, changed, indices
 from gridsec.estimators.modal import signatures
 from gridsec.estimators.modal.filter import Update
 from gridsec.estimators.modal.model import Modes
@@ -66,8 +66,8 @@ LATE = 6
 """Least age of an onset in the ticks from one evaluation to the next, 1: alarms are late by a sixth of it."""
 RAMP_EVERY = RARELY
 """Ticks from one onset of a ramp to the next: a ramp of fewer ticks is not told from a step."""
-JUMP = 16.0
-"""Squared standardised score of one innovation that has M evaluated at once, 1: 8 nats of the 17 of an alarm."""
+JUMP = 12.25
+"""Squared standardised score of one innovation that has M evaluated at once, 1: 3.5 standard deviations."""
 OLDEST = 14400
 """Largest age of an onset, ticks: beyond it the filter has learned a step as a fixed error."""
 PINS = 3
@@ -209,7 +209,7 @@ def pin(detector: Detector, rows: Ints) -> Detector:
     """
     pinned = np.zeros_like(detector.pinned)
     pinned[rows[:PINS]] = True
-    return replace(detector, pinned=pinned & detector.onsets.used)
+    return changed(detector, pinned=pinned & detector.onsets.used)
 
 
 def step(
@@ -225,10 +225,10 @@ def step(
     """Take in one step of the filter and evaluate M, if that is due.
 
     All onsets and powers are evaluated at the first `EVERY` ticks, at every `RARELY`-th, and while log M was
-    above `alert`. An onset of up to `LATE` n ticks is evaluated at the multiples of n, n being `EVERY` and its
-    doubles. Young and pinned ones are evaluated at every tick while an onset is pinned, with powers, where a
-    reading is missing, and where one innovation stands out by itself. The choice may depend on the readings:
-    what is left out only makes M smaller.
+    above `alert`. An onset of up to `LATE` n ticks is evaluated at the multiples of n, n being `EVERY` and
+    its doubles. Pinned and young ones are evaluated at every tick while an onset is pinned, with powers.
+    Young ones are, too, where a reading is missing, and where one innovation stands out by itself. What is
+    evaluated may depend on the readings: what is left out only makes M smaller.
 
     Parameters
     ----------
@@ -249,7 +249,7 @@ def step(
     least = precision(modes, None if regular else before.precision, update)
     alerted = suspected or before.log_m >= alert
     due = regular or alerted or update.seen is not None or _stands_out(modes, update, static, least)
-    before = replace(before, ticks=ticks, precision=least, waiting=waiting)
+    before = changed(before, ticks=ticks, precision=least, waiting=waiting)
     if not due and update.exact is None:
         return before, _NO_EVIDENCE
     now = followed(modes, before)
@@ -259,7 +259,7 @@ def step(
     if ticks <= EVERY or (alerted and not suspected):
         every = RARELY
     now, evidence = evaluated(modes, columns, now, static, every)
-    return now if regular else replace(now, ratio=None), evidence
+    return now if regular else changed(now, ratio=None), evidence
 
 
 def followed(modes: Modes, before: Detector) -> Detector:
@@ -292,7 +292,7 @@ def followed(modes: Modes, before: Detector) -> Detector:
             ended=ended,
             own=onsets is not before.onsets,
         )
-    return replace(before, onsets=onsets, capital=capital, ratio=None, waiting=())
+    return changed(before, onsets=onsets, capital=capital, ratio=None, waiting=())
 
 
 def evaluated(
@@ -319,7 +319,7 @@ def evaluated(
         by_row[:, onsets.ramp & (onsets.age < RAMP_EVERY)] = -inf
     top = float(by_row.max())
     log_m = top + log(float(np.exp(by_row - top).sum()))
-    return replace(test, ratio=ratio, log_m=log_m), Evidence(log_m, by_row)
+    return changed(test, ratio=ratio, log_m=log_m), Evidence(log_m, by_row)
 
 
 def _stands_out(modes: Modes, update: Update, static: Static, least: Precision) -> bool:
