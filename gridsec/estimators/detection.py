@@ -367,6 +367,10 @@ class DecisionInputs:
     busbar: bool
 
 
+AGREEMENT = Decision.CLEAN, Cause.AGREEMENT, "All meters agree with the feeder."
+"""The answer if no other cause applies."""
+
+
 def decide(now: DecisionInputs) -> tuple[Decision, Cause, str]:
     """The answer, its cause, and one sentence for an operator.
 
@@ -381,7 +385,7 @@ def decide(now: DecisionInputs) -> tuple[Decision, Cause, str]:
     doubt = _doubt(now)
     if doubt is not None:
         return Decision.UNDECIDED, *doubt
-    return Decision.CLEAN, Cause.AGREEMENT, "All meters agree with the feeder."
+    return AGREEMENT
 
 
 def _blind(now: DecisionInputs) -> tuple[Cause, str] | None:

@@ -10,10 +10,11 @@ the tree.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 
-from gridsec.arrays import Floats, Ints, all_of, any_of, frozen, frozen_ints, put
+from gridsec.arrays import Floats, Ints, Phasors, all_of, any_of, frozen, frozen_ints, put
 from gridsec.errors import FeederInvalid, InputInvalid, Problem, wrong_shapes
 from gridsec.grid.network import (
     Balanced,
@@ -145,7 +146,7 @@ class Feeder(Balanced):
         p, q (…, N): sizes of the customers' active and reactive powers, not negative, pu.
         Returns (…, b + 1): change at every bus, pu.
         """
-        drop = -2.0 * _drop(self.sweep, _flows(self.sweep, p, q))
+        drop = -_drop(self.sweep, _flows(self.sweep, p, q))
         return _along_paths(self.sweep, drop).take(self.walk.start, axis=-1)
 
     def with_customers_at(self, places: Ints) -> Feeder:
@@ -327,7 +328,9 @@ class _Sweep:
     Arrays of branches have an entry for the root, which is 0.
     """
 
-    z: Floats  # (2, b + 1) r and x
+    # z, twice (b + 1,): r + j x, and 2 (r - j x), so that the real part of its product with P + j Q is a drop
+    z: Phasors
+    twice: Phasors
     squared: Floats  # (b + 1,)
     half: Floats  # (b + 1,)
     order: Ints  # (N + 1,) a leading zero, then the customers in this order
@@ -350,31 +353,27 @@ def _sweep(feeder: Feeder) -> _Sweep:
     first, last = (np.searchsorted(at[order], end) for end in (start, stop))
     steps, sign = np.empty(2 * count, dtype=np.intp), np.ones(2 * count)
     steps[enter], steps[leave], sign[leave] = number, number, -1.0
-    z, squared = np.zeros((2, count)), np.zeros(count)
-    z[:, 1:], squared[1:] = (feeder.r[branch], feeder.x[branch]), feeder.squared[branch]
+    z, squared = np.zeros(count, dtype=np.complex128), np.zeros(count)
+    z[1:], squared[1:] = feeder.r[branch] + 1j * feeder.x[branch], feeder.squared[branch]
     order = np.concatenate([[0], order + 1])
     first, last, end, steps, enter, at = map(frozen_ints, (first, last, stop - 1, steps, enter, at))
-    half = frozen(feeder.half[tree.order])
-    return _Sweep(
-        frozen(z), frozen(squared), half, frozen_ints(order), first, last, end, steps, frozen(sign), enter, at
-    )
+    half, squared, order = frozen(feeder.half[tree.order]), frozen(squared), frozen_ints(order)
+    return _Sweep(z, 2.0 * z.conj(), squared, half, order, first, last, end, steps, frozen(sign), enter, at)
 
 
-def _flows(sweep: _Sweep, p: Floats, q: Floats) -> Floats:
-    """Flows into each branch without losses, minus the injections (…, N) below it, (…, 2, b + 1)."""
-    both = np.zeros((*np.broadcast(p, q).shape[:-1], 2, sweep.order.size))
-    both[..., 0, 1:], both[..., 1, 1:] = p, q
+def _flows(sweep: _Sweep, p: Floats, q: Floats) -> Phasors:
+    """P + j Q into each branch without losses, minus the injections (…, N) below it, (…, b + 1)."""
+    both = np.zeros((*np.broadcast(p, q).shape[:-1], sweep.order.size), dtype=np.complex128)
+    both.real[..., 1:], both.imag[..., 1:] = p, q
     total = both.take(sweep.order, axis=-1).cumsum(axis=-1)
     out = total.take(sweep.first, axis=-1)
     out -= total.take(sweep.last, axis=-1)
     return out
 
 
-def _drop(sweep: _Sweep, flows: Floats) -> Floats:
-    """``r P + x Q`` of flows (…, 2, b + 1)."""
-    out = flows[..., 0, :] * sweep.z[0]
-    out += flows[..., 1, :] * sweep.z[1]
-    return np.asarray(out)
+def _drop(sweep: _Sweep, flows: Phasors) -> Floats:
+    """``2 (r P + x Q)`` of flows, (…, b + 1)."""
+    return np.asarray((flows * sweep.twice).real)
 
 
 def _along_paths(sweep: _Sweep, values: Floats) -> Floats:
@@ -384,7 +383,10 @@ def _along_paths(sweep: _Sweep, values: Floats) -> Floats:
     return walked.cumsum(axis=-1).take(sweep.enter, axis=-1)
 
 
-def _farther(sweep: _Sweep, values: Floats) -> Floats:
+_Values = TypeVar("_Values", Floats, Phasors)
+
+
+def _farther(sweep: _Sweep, values: _Values) -> _Values:
     """Sums of values (…, b + 1) below each branch, without its own, (…, b + 1)."""
     total = values.cumsum(axis=-1)
     out = total.take(sweep.end, axis=-1)
@@ -396,7 +398,7 @@ def _farther(sweep: _Sweep, values: Floats) -> Floats:
 class _Flows:
     """Power flow in the order of the sweep, (…, b + 1) each with an entry for the root."""
 
-    flows: Floats  # (…, 2, b + 1) P and Q at the end of the branches
+    flows: Phasors  # P + j Q at the end of the branches
     charged: Floats  # Q less the supply from charging below
     v2: Floats  # squared voltages
 
@@ -406,8 +408,8 @@ def _linear_flows(feeder: Feeder, p: Floats, q: Floats, v0_squared: Floats | flo
     sweep = feeder.sweep
     flows = _flows(sweep, p, q)
     base = np.asarray(v0_squared, dtype=np.float64)[..., None]
-    v2 = base + _along_paths(sweep, -2.0 * _drop(sweep, flows))
-    charged = flows[..., 1, :]
+    v2 = base - _along_paths(sweep, _drop(sweep, flows))
+    charged = flows.imag
     if feeder.charges:
         supply = sweep.half * v2
         charged = charged - _farther(sweep, supply)
@@ -419,20 +421,20 @@ def _lossy(feeder: Feeder, flows: _Flows, now: _Flows, steps: int) -> _Flows:
     """The linear power flow with the losses of the flows `now`, repeated `steps` times."""
     sweep = feeder.sweep
     for _ in range(steps):
-        P = now.flows[..., 0, :]
+        P = now.flows.real
         current = (P * P + now.charged * now.charged) / now.v2
-        lost = _farther(sweep, sweep.z * current[..., None, :])
+        lost = _farther(sweep, sweep.z * current)
         if feeder.charges:
             if now is flows:
-                lost[..., 1, :] += now.charged - now.flows[..., 1, :]
+                lost.imag += now.charged - now.flows.imag
             else:
                 supply = sweep.half * now.v2
-                lost[..., 1, :] -= _farther(sweep, supply) + supply
-        drop = 2.0 * _drop(sweep, lost)
+                lost.imag -= _farther(sweep, supply) + supply
+        drop = _drop(sweep, lost)
         drop += sweep.squared * current
         lost += flows.flows
         # The losses include charging.
-        now = _Flows(lost, lost[..., 1, :], flows.v2 - _along_paths(sweep, drop))
+        now = _Flows(lost, lost.imag, flows.v2 - _along_paths(sweep, drop))
     return now
 
 
@@ -441,15 +443,15 @@ def _remainder(feeder: Feeder, flows: _Flows, once: _Flows) -> Floats:
     with np.errstate(all="ignore"):
         # Increments of the first and of the second step.
         current, charge = np.empty((2, *flows.v2.shape)), np.empty((2, *flows.v2.shape))
-        np.divide(flows.flows[..., 0, :] ** 2 + flows.charged**2, flows.v2, out=current[0])
-        np.subtract((once.flows**2).sum(axis=-2) / once.v2, current[0], out=current[1])
+        np.divide(flows.flows.real**2 + flows.charged**2, flows.v2, out=current[0])
+        np.subtract((once.flows.real**2 + once.flows.imag**2) / once.v2, current[0], out=current[1])
         np.abs(current, out=current)
-        lost = _farther(sweep, sweep.z * current[..., None, :])
+        lost = _farther(sweep, sweep.z * current)
         if feeder.charges:
             charge[0], charge[1] = flows.v2, once.v2 - flows.v2
             supply = np.abs(sweep.half * charge)
-            lost[..., 1, :] += _farther(sweep, supply) + supply
-        first, second = _along_paths(sweep, 2.0 * _drop(sweep, lost) + sweep.squared * current)
+            lost.imag += _farther(sweep, supply) + supply
+        first, second = _along_paths(sweep, _drop(sweep, lost) + sweep.squared * current)
         shrinks = shrinking(first, second, (-1,))
         shrinks &= np.all((flows.v2 > 0) & (once.v2 > 0), axis=-1, keepdims=True)
         bound = np.where(shrinks, 2.0 * second, np.inf)

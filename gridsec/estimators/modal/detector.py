@@ -39,13 +39,13 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from math import exp, inf, log, log1p, sqrt
+from dataclasses import dataclass, field
+from math import exp, gcd, inf, log, log1p, sqrt
 
 import numpy as np
 from scipy.linalg import lapack
 
-from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, changed, indices
 from gridsec.estimators.modal import signatures
 from gridsec.estimators.modal.filter import Update
 from gridsec.estimators.modal.model import Modes
@@ -60,14 +60,12 @@ RAMPS = 0.1
 """Share of ramps in all weights, 1: a ramp is also seen by steps, later."""
 STEP_ROWS, RAMP_ROWS = 18, 6
 """Onsets of steps and of ramps that are kept. Ages grow by about 1.7 from row to row up to `OLDEST`."""
-EVERY = 4
-"""Ticks from one evaluation of most onsets and of powers to the next: they take most of the time."""
-RAMP_EVERY = 4 * EVERY
+EVERY, RARELY = 4, 16
+"""Ticks from one evaluation of young onsets to the next, and from one of all onsets and of powers."""
+LATE = 6
+"""Least age of an onset in the ticks from one evaluation to the next, 1: alarms are late by a sixth of it."""
+RAMP_EVERY = RARELY
 """Ticks from one onset of a ramp to the next: a ramp of fewer ticks is not told from a step."""
-OLD, RARELY = 64 * EVERY, 4 * EVERY
-"""Age from which on an onset is evaluated at every `RARELY`-th tick, ticks: later by a sixteenth of it."""
-YOUNG = 6 * EVERY
-"""Largest age of onsets that are evaluated at every tick, ticks: `EVERY` is a sixth of it."""
 JUMP = 12.25
 """Squared standardised score of one innovation that has M evaluated at once, 1: 3.5 standard deviations."""
 OLDEST = 14400
@@ -211,7 +209,7 @@ def pin(detector: Detector, rows: Ints) -> Detector:
     """
     pinned = np.zeros_like(detector.pinned)
     pinned[rows[:PINS]] = True
-    return replace(detector, pinned=pinned & detector.onsets.used)
+    return changed(detector, pinned=pinned & detector.onsets.used)
 
 
 def step(
@@ -226,11 +224,11 @@ def step(
 ) -> tuple[Detector, Evidence]:
     """Take in one step of the filter and evaluate M, if that is due.
 
-    All onsets are evaluated at the first `EVERY` ticks, and then at every `EVERY`-th, those older than `OLD`
-    at every `RARELY`-th. Young and pinned ones are evaluated at every tick while an onset is pinned, while
-    log M was above `alert`, where a reading is missing, and where one innovation stands out by itself. Powers
-    are evaluated with the first two and while an onset is pinned: an alarm by them alone lasts. The choice
-    may depend on the readings: what is left out only makes M smaller.
+    All onsets and powers are evaluated at the first `EVERY` ticks, at every `RARELY`-th, and while log M was
+    above `alert`. An onset of up to `LATE` n ticks is evaluated at the multiples of n, n being `EVERY` and
+    its doubles. Pinned and young ones are evaluated at every tick while an onset is pinned, with powers.
+    Young ones are, too, where a reading is missing, and where one innovation stands out by itself. What is
+    evaluated may depend on the readings: what is left out only makes M smaller.
 
     Parameters
     ----------
@@ -246,16 +244,22 @@ def step(
         log M from which on it is evaluated at every tick.
     """
     ticks, waiting = before.ticks + 1, (*before.waiting, Tick(update, static, h))
-    full, suspected = ticks <= EVERY or ticks % EVERY == 0, any_of(before.pinned)
+    regular, suspected = ticks <= EVERY or ticks % EVERY == 0, any_of(before.pinned)
     # The variances fall: an old bound is too low to be of use.
-    least = precision(modes, None if full else before.precision, update)
-    always = full or suspected or update.seen is not None or before.log_m >= alert
-    due = always or _stands_out(modes, update, static, least)
-    before = replace(before, ticks=ticks, precision=least, waiting=waiting)
+    least = precision(modes, None if regular else before.precision, update)
+    alerted = suspected or before.log_m >= alert
+    due = regular or alerted or update.seen is not None or _stands_out(modes, update, static, least)
+    before = changed(before, ticks=ticks, precision=least, waiting=waiting)
     if not due and update.exact is None:
         return before, _NO_EVIDENCE
     now = followed(modes, before)
-    return evaluated(modes, columns, now, static, full=full) if due else (now, _NO_EVIDENCE)
+    if not due:
+        return now, _NO_EVIDENCE
+    every = gcd(ticks, RARELY) if regular else EVERY
+    if ticks <= EVERY or (alerted and not suspected):
+        every = RARELY
+    now, evidence = evaluated(modes, columns, now, static, every)
+    return now if regular else changed(now, ratio=None), evidence
 
 
 def followed(modes: Modes, before: Detector) -> Detector:
@@ -288,36 +292,34 @@ def followed(modes: Modes, before: Detector) -> Detector:
             ended=ended,
             own=onsets is not before.onsets,
         )
-    return replace(before, onsets=onsets, capital=capital, ratio=None, waiting=())
+    return changed(before, onsets=onsets, capital=capital, ratio=None, waiting=())
 
 
 def evaluated(
-    modes: Modes, columns: Columns, test: Detector, static: Static, *, full: bool
+    modes: Modes, columns: Columns, test: Detector, static: Static, every: int
 ) -> tuple[Detector, Evidence]:
-    """M of most onsets, or of the young and the pinned ones.
+    """M of the onsets that are due by their age, and of the pinned ones.
 
     Parameters
     ----------
     modes, columns, test, static
         As in `step`; no tick is waiting.
-    full
-        All onsets up to the age `OLD`, and all when the old ones are due.
+    every
+        Ticks since the last evaluation of all of them; `RARELY` for all onsets with powers.
     """
     onsets, capital, due = test.onsets, test.capital, test.onsets.used
-    if not full:
-        due = due & (((onsets.age <= YOUNG) & ~onsets.ramp) | test.pinned)
-    elif test.ticks > EVERY and test.ticks % RARELY:
-        due = due & ((onsets.age <= OLD) | test.pinned)
+    if every < RARELY:
+        due = due & (((onsets.age <= LATE * every) & ~onsets.ramp) | test.pinned)
     rows, ratio = indices(due), np.full(capital.shape, -inf)
     now = signatures.scores(modes, onsets, static, rows)
-    ratio[:, rows] = log_ratios(columns, modes, now, full or any_of(test.pinned))
+    ratio[:, rows] = log_ratios(columns, modes, now, every == RARELY or any_of(test.pinned))
     by_row = capital + _LOG_WEIGHTS + ratio
     if any_of(due[_STEPS:]):
         # A ramp has its capital at the last tick of those that it stands for.
         by_row[:, onsets.ramp & (onsets.age < RAMP_EVERY)] = -inf
     top = float(by_row.max())
     log_m = top + log(float(np.exp(by_row - top).sum()))
-    return replace(test, ratio=ratio if full else None, log_m=log_m), Evidence(log_m, by_row)
+    return changed(test, ratio=ratio, log_m=log_m), Evidence(log_m, by_row)
 
 
 def _stands_out(modes: Modes, update: Update, static: Static, least: Precision) -> bool:

@@ -209,11 +209,10 @@ def jump(
     if doubt.sudden_p is not None:
         # Unknown directions of every frame.
         level[np.tile(doubt.sudden_p > 0.0, 2)] = 0.0
-    if frame.p_origin is not None:
-        read = frame.p_origin == PowerOrigin.READ
-        if not all_of(read):
-            # Powers that come back are compared with their last reading.
-            level = np.where(np.tile(read, 2), level, np.nan if before is None else before.level)
+    if frame.p_origin is not None and any_of(frame.p_origin):
+        # Powers that come back are compared with their last reading.
+        read = np.tile(frame.p_origin == PowerOrigin.READ, 2)
+        level = np.where(read, level, np.nan if before is None else before.level)
     if before is None:
         return 0.0, Movements(level, np.zeros((2, 2 * N)), metered)
     change = level - before.level
@@ -292,7 +291,9 @@ def _unsettled(
     error = droop.per_customer(injected, N) / np.sqrt(3.0)
     usually = design.injections + droop.per_customer(design.mismatch, N)
     far = error > UNSETTLED * np.maximum(usually, EXACT)
-    out = (far | (droop.per_customer(free.astype(np.float64), N) > 0.0)) & ~metered
+    out = far & ~metered
+    if any_of(free):
+        out |= (droop.per_customer(free.astype(np.float64), N) > 0.0) & ~metered
     return (np.where(out, error, 0.0), np.where(far, WIDER, FOLLOWS)) if any_of(out) else None
 
 

@@ -273,9 +273,9 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     )
     h, free = frame.t - given.t, front.inverters_of(~given.trust.trusted)
     injections = drive.followed(front, state.injections, given, predicted, free, h)
-    jumps = trusted & ~given.trust.trusted
     held = state.held
-    if any_of(jumps) or any_of(held):
+    if given.trust.trusted is not trusted or any_of(held):
+        jumps = trusted & ~given.trust.trusted
         held = np.where(jumps, HELD, np.maximum(held - measured.available, 0))
     v2 = predicted.v2_bus[front.prior.meters]
     skew = given.clock_skew
@@ -489,7 +489,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         settled=all_of(tick.predicted.transient <= design.negligible),
         inverters=inverters,
         busbar=busbar.named,
-        metered=np.atleast_1d(np.asarray(tick.measured.busbar_metered)),
+        metered=now.busbar.trusted & tick.measured.busbar_metered,
         busbar_off=np.where(busbar.named, busbar.off, 0.0),
     )
     kinds = _kinds(design, state, tick, estimate, named)
@@ -513,8 +513,11 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         record.kept(design.core.modes, state.kept, kernel.filter, kernel.static, now.ticks) if calm else None
     )
     learning = _gathered(design, trust, tick, suspected=doubtful)
-    # A false reading has driven the inverters of meters that lose their trust.
-    fed = front.inverters_of(now.trust.trusted & ~trust.trust.trusted)
+    error, injections = tick.predicted.injection_error, tick.injections
+    if trust is not now:
+        # A false reading has driven the inverters of meters that lose their trust.
+        fed = front.inverters_of(now.trust.trusted & ~trust.trust.trusted)
+        error, injections = error.reset(fed), injections.reset(fed)
     after = changed(
         trust,
         t=tick.measured.frame.t,
@@ -523,7 +526,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         x=tick.predicted.x,
         transient=tick.predicted.transient,
         model_driven=tick.predicted.model_driven,
-        injection_error=tick.predicted.injection_error.reset(fed),
+        injection_error=error,
         inverter_checks=checks,
         attack_kinds=kinds,
         busbar=busbar,
@@ -536,7 +539,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         front=after,
         kept=kept or state.kept,
         held=tick.held,
-        injections=tick.injections.reset(fed),
+        injections=injections,
         fit=drive.fitted(design.core, kernel, state.fit, now.ticks, None if state.suspicion else mean),
     )
     return (out if learning is None else _learned(design, out)), estimate, answer

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from gridsec.arrays import PENDING, Bools, Floats, all_of, any_of, deferred, indices
-from gridsec.estimators.detection import DecisionInputs, decide
+from gridsec.estimators.detection import AGREEMENT, DecisionInputs, decide
 from gridsec.estimators.modal import detector, masking, signatures
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
@@ -444,6 +444,15 @@ class Inputs:
     metered: Bools
     busbar_off: Floats
 
+    @property
+    def calm(self) -> bool:
+        """True where all meters are read and tested, and nothing speaks against one."""
+        if self.suspected or not self.settled or self.frame.clock_offset is not None:
+            return False
+        every = self.seen, self.evidence.tested, self.metered
+        against = self.named, self.unread, self.jumps, self.beyond, self.inverters, self.busbar
+        return all(map(all_of, every)) and not any(map(any_of, against))
+
 
 def verdict(design: SequentialDesign, now: Inputs, estimate: Estimate) -> Finding:
     """Decision, cause and sentence.
@@ -457,6 +466,8 @@ def verdict(design: SequentialDesign, now: Inputs, estimate: Estimate) -> Findin
     estimate
         The estimate of the tick.
     """
+    if now.calm:
+        return AGREEMENT
     tested = now.seen
     live = int(np.count_nonzero(tested))
     finding = decide(

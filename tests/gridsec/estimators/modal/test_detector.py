@@ -355,3 +355,35 @@ def test_m_is_evaluated_at_every_tick_without_all_readings(silent: int | None) -
         assert (evidence.log_m > -inf) == (
             silent is not None or k <= detector.EVERY or k % detector.EVERY == 0
         )
+
+
+def test_onsets_are_evaluated_at_intervals_of_a_sixth_of_their_age() -> None:
+    """Up to 24 ticks at every 4th, up to 48 at every 8th, all at every 16th and at the first 4; no ramps."""
+    made = modes(busbar())
+    of = signatures.columns(made, power_columns(FEEDER), np.full(24, 0.05), 0.01)
+    state, more, test = modal.start(made, 0.0), static.start(made), detector.start(made)
+    for k in range(1, 161):
+        state, more, update = full.step(made, state, more, float(k), np.zeros(12))
+        test, evidence = detector.step(made, of, test, update, more, h=1.0, alert=inf)
+        age, step = test.onsets.age, test.onsets.used & ~test.onsets.ramp
+        most = inf if k <= 4 or k % 16 == 0 else 48 if k % 8 == 0 else 24 if k % 4 == 0 else -inf
+        if k % 4 == 0:
+            assert (np.isfinite(evidence.by_row).all(axis=0)[step] == (age <= most)[step]).all()
+        else:
+            assert k <= 4 or not np.isfinite(evidence.by_row).any()
+
+
+def test_all_onsets_are_evaluated_while_m_is_near_the_limit() -> None:
+    """Also at ticks at which none is due; the capital of ramps counts from 16 ticks on."""
+    made = modes(busbar())
+    of = signatures.columns(made, power_columns(FEEDER), np.full(24, 0.05), 0.01)
+    state, more, test = modal.start(made, 0.0), static.start(made), detector.start(made)
+    for k in range(1, 80):
+        state, more, update = full.step(made, state, more, float(k), np.zeros(12))
+        test, evidence = detector.step(made, of, test, update, more, h=1.0, alert=-inf)
+        used, ripe = test.onsets.used, ~test.onsets.ramp | (test.onsets.age >= 16)
+        now = signatures.scores(made, test.onsets, more)
+        ratio = detector.log_ratios(of, made, now, powers=True)
+        by_row = test.capital + np.log([[0.5], [0.35], [0.15]]) + ratio
+        assert np.allclose(evidence.by_row[:, used & ripe], by_row[:, used & ripe], atol=1e-9)
+        assert np.isclose(np.logaddexp.reduce(by_row[:, used & ripe], axis=None), evidence.log_m, atol=1e-9)

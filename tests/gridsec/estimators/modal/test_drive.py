@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmarks._residuals import Dense, Source
 from gridsec.arrays import Floats
-from gridsec.estimators.modal import core, doubts
+from gridsec.estimators.modal import core, doubts, drive
 from gridsec.estimators.modal.filter import Interval
 from gridsec.estimators.modal.monitor import ModalDesign, ModalState, design, init, step
-from gridsec.estimators.modal.verdict import deviations
+from gridsec.estimators.modal.verdict import Inputs, deviations
+from gridsec.estimators.sequential.state import InjectionError
 from gridsec.interface import Decision, Frame, Verdict
 from tests.gridsec.estimators.modal.test_core import MODEL
 from tests.gridsec.estimators.sequential.test_monitor import prepare
@@ -99,3 +101,32 @@ def test_readings_that_alternate_are_never_clean(lies: tuple[int, ...]) -> None:
         assert verdict.decision is not Decision.CLEAN
         assert not (verdict.suspects & honest).any()
     assert told[-1][1].suspects.any()
+
+
+def test_errors_of_injections_are_those_of_the_front_end_without_a_distrusted_meter(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With equal errors before, those after are equal by the recursion, too."""
+    plain, told = drive.followed, []
+
+    def both(front: Any, before: Any, given: Any, now: Any, *rest: Any) -> InjectionError:
+        out = plain(front, before, given, now, *rest)
+        told.append((out, plain(front, replace(before), given, now, *rest), now.injection_error))
+        return out
+
+    monkeypatch.setattr(drive, "followed", both)
+    watched(())
+    for found, recursion, own in told:
+        assert found is own
+        for name in ("error", "input", "width"):
+            assert np.allclose(getattr(found, name), getattr(recursion, name), rtol=1e-12)
+
+
+@pytest.mark.parametrize("lies", [(), (4, 7, 9)], ids=["honest", "a quarter"])
+def test_the_answer_of_a_calm_tick_is_that_of_all_checks(
+    lies: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calm = [(each.decision, each.cause, each.reason) for _, each, _ in watched(lies)[1]]
+    monkeypatch.setattr(Inputs, "calm", False)
+    assert calm == [(each.decision, each.cause, each.reason) for _, each, _ in watched(lies)[1]]
+    assert len(set(calm)) > 1
