@@ -32,19 +32,14 @@ has the relaxation
 
     minimise  x^2 g' F g / 2 - x y' g,      0 <= g <= 1
 
-which is convex [1]_. With any amounts of the sign, and independent ones of the rest, it is a minimum over z
->= 0 of all usable meters, ``z' F z / 2 - z' y``, a bound. Where that is above the limit of a naming, the
-meters with the largest z are the only g. Elsewhere the relaxation's solution orders the meters. The best
-beginning of this order is improved by single meters and by exchanges. x is first the mean amount of C, then
-that of the set found. Where that gains nothing and the solution has more meters than the promise, x is
-larger. Where the best g has meters of C, the best one without them is also found. g is also looked for in
-place of the rest's meters of its own sign, since colluding meters may share one amount, and of its faults
-that are no meters.
-
-References
-----------
-.. [1] Byrd, Lu, Nocedal and Zhu, A limited memory algorithm for bound constrained optimization, SIAM Journal
-   on Scientific Computing 16, 1995 (the solver).
+which is convex (`alike.bounded_minimum`). With any amounts of the sign, and independent ones of the rest, it
+is a minimum over z >= 0 of all usable meters, ``z' F z / 2 - z' y``, a bound. Where that is above the limit
+of a naming, the meters with the largest z are the only g. Elsewhere the relaxation's solution orders the
+meters. The best beginning of this order is improved by single meters and by exchanges. x is first the mean
+amount of C, then that of the set found. Where that gains nothing and the solution has more meters than the
+promise, x is larger. Where the best g has meters of C, the best one without them is also found. g is also
+looked for in place of the rest's meters of its own sign, since colluding meters may share one amount, and of
+its faults that are no meters.
 """
 
 from __future__ import annotations
@@ -421,10 +416,7 @@ class _Relaxed:
         return out
 
     def bound(self) -> tuple[float, Bools]:
-        """Bound of the fits of all sets with amounts of the sign, at most 0, and the meters with the largest.
-
-        The bound holds to the tolerance of the solver.
-        """
+        """Bound of the fits of all sets with amounts of the sign, at most 0, and meters with the largest."""
         z = bounded_minimum(self.F, self.y, np.zeros(self.y.size), inf)
         order = np.argsort(-z, kind="stable")
         inside = np.zeros(z.size, dtype=np.bool_)
