@@ -39,7 +39,8 @@ from gridsec.arrays import Floats, Ints
 from gridsec.estimators.modal import core, verdict
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
-from gridsec.estimators.modal.monitor import CONFIRM, LOOKS, confirmed
+from gridsec.estimators.modal.monitor import LOOKS
+from gridsec.estimators.modal.naming import CONFIRM, confirmed
 from gridsec.grid.network import Power
 
 QUIET, WATCHED, RAMP = 60, 60, 90

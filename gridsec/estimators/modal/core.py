@@ -82,6 +82,8 @@ Three ticks in turn have it. With kettles in 57 households, and no report of any
 """
 ADOPTED = 0.05
 """Largest weight of sets that need a meter where loads are adopted, 1: a meter may hide its own load."""
+TRIALS = 4
+"""Trials of a transition while the age of an onset doubles, about, 1: the replay takes a second or so."""
 RECALLED = 24
 """Largest number of explanations that the next search knows, 1."""
 CALM = 0.5
@@ -384,9 +386,11 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
         return seen if k < first else ~named if seen is None else seen & ~named, unknown
 
     now, evidence = again(core, state, first, masked, begun)
-    amount = np.zeros(core.effect.shape[1])
-    chosen = suspicion.found.chosen[0]
-    amount[chosen] = mean_amounts(suspicion.found.problems[int(suspicion.found.model[0])], chosen)
+    found, amount = suspicion.found, np.zeros(core.effect.shape[1])
+    model, chosen = int(found.model[0]), found.chosen[0]
+    # The amounts of a ramp are those of its unit of time.
+    joint = state.rivals[model].joint() if model else _joint(core, _parts(state), suspicion.row)
+    amount[chosen] = joint.level * mean_amounts(found.problems[model], chosen)
     return replace(now, masked=masking.added(state.masked, named, amount[: named.size])), evidence
 
 
@@ -560,6 +564,8 @@ def _fits(state: CoreState, found: Identification, age: int) -> bool:
     for at in dict.fromkeys((0, int((found.model == 0).argmax()))):
         number, chosen = int(found.model[at]), found.chosen[at]
         problem, model = found.problems[number], state.rivals[number]
+        if model.transition and not any_of(chosen):
+            continue
         # Twice the logarithm of a ratio of likelihoods.
         gain = float(problem.y[chosen] @ mean_amounts(problem, chosen)) * min(1.0, model.ticks / age)
         chance = BY_CHANCE * sqrt(2.0 * model.count)
@@ -586,7 +592,8 @@ def _aligned(core: Core, found: Identification) -> bool:
 def transition(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
     """Add a rival with a transition since the onset, where no explanation fits and it is the likeliest one.
 
-    An earlier one is replaced. The state is unchanged where another model is likelier.
+    An earlier one is replaced. The state is unchanged where another model is likelier. Older onsets are tried
+    at about every fifth part of their age.
 
     Parameters
     ----------
@@ -595,7 +602,8 @@ def transition(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
     suspicion
         The explanations after the same tick.
     """
-    if suspicion.fits or not state.rivals:
+    age = int(state.detector.onsets.age[suspicion.row])
+    if suspicion.fits or not state.rivals or age % max(1, age // TRIALS):
         return state
 
     def cost_of(rival: Rival) -> float:

@@ -61,7 +61,7 @@ RAMPS = 0.1
 STEP_ROWS, RAMP_ROWS = 18, 6
 """Onsets of steps and of ramps that are kept. Ages grow by about 1.7 from row to row up to `OLDEST`."""
 EVERY, RARELY = 4, 16
-"""Ticks from one evaluation of young onsets to the next, and from one of all onsets and of powers."""
+"""Ticks from one evaluation of young onsets to the next, and from one of all onsets."""
 LATE = 6
 """Least age of an onset in the ticks from one evaluation to the next, 1: alarms are late by a sixth of it."""
 RAMP_EVERY = RARELY
@@ -224,11 +224,12 @@ def step(
 ) -> tuple[Detector, Evidence]:
     """Take in one step of the filter and evaluate M, if that is due.
 
-    All onsets and powers are evaluated at the first `EVERY` ticks, at every `RARELY`-th, and while log M was
-    above `alert`. An onset of up to `LATE` n ticks is evaluated at the multiples of n, n being `EVERY` and
-    its doubles. Pinned and young ones are evaluated at every tick while an onset is pinned, with powers.
-    Young ones are, too, where a reading is missing, and where one innovation stands out by itself. What is
-    evaluated may depend on the readings: what is left out only makes M smaller.
+    All onsets are evaluated at the first `EVERY` ticks, at every `RARELY`-th, and while log M was above
+    `alert`. An onset of up to `LATE` n ticks is evaluated at the multiples of n, n being `EVERY` and its
+    doubles. Pinned and young ones are evaluated at every tick while an onset is pinned. Powers are evaluated
+    with all these: the hand-over of capital needs their Lambda. Young onsets are evaluated without powers
+    where a reading is missing, and where one innovation stands out by itself. What is evaluated may depend on
+    the readings: what is left out only makes M smaller.
 
     Parameters
     ----------
@@ -258,7 +259,7 @@ def step(
     every = gcd(ticks, RARELY) if regular else EVERY
     if ticks <= EVERY or (alerted and not suspected):
         every = RARELY
-    now, evidence = evaluated(modes, columns, now, static, every)
+    now, evidence = evaluated(modes, columns, now, static, every, powers=regular or every == RARELY)
     return now if regular else changed(now, ratio=None), evidence
 
 
@@ -296,7 +297,7 @@ def followed(modes: Modes, before: Detector) -> Detector:
 
 
 def evaluated(
-    modes: Modes, columns: Columns, test: Detector, static: Static, every: int
+    modes: Modes, columns: Columns, test: Detector, static: Static, every: int, *, powers: bool
 ) -> tuple[Detector, Evidence]:
     """M of the onsets that are due by their age, and of the pinned ones.
 
@@ -305,14 +306,16 @@ def evaluated(
     modes, columns, test, static
         As in `step`; no tick is waiting.
     every
-        Ticks since the last evaluation of all of them; `RARELY` for all onsets with powers.
+        Ticks since the last evaluation of all of them; `RARELY` for all onsets.
+    powers
+        With powers also where no onset is pinned.
     """
     onsets, capital, due = test.onsets, test.capital, test.onsets.used
     if every < RARELY:
         due = due & (((onsets.age <= LATE * every) & ~onsets.ramp) | test.pinned)
     rows, ratio = indices(due), np.full(capital.shape, -inf)
     now = signatures.scores(modes, onsets, static, rows)
-    ratio[:, rows] = log_ratios(columns, modes, now, every == RARELY or any_of(test.pinned))
+    ratio[:, rows] = log_ratios(columns, modes, now, powers or any_of(test.pinned))
     by_row = capital + _LOG_WEIGHTS + ratio
     if any_of(due[_STEPS:]):
         # A ramp has its capital at the last tick of those that it stands for.

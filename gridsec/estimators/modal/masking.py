@@ -6,10 +6,12 @@ the posterior of its fixed error, so that the reading r of a masked meter is com
     r - (w + b)   has the variance   P + d   at one tick, and   P + d / n   as a mean of n ticks
 
 with P the variance of w + b, which changes slowly, and d the white variance. Unknown directions U of the tick
-have amounts N(0, `LASTS`^2) that last; what the other readings tell about them is used. With the innovation's
-covariance V, ``V^-1 = L^-T L^-1``, innovation nu, ``A = L^-1 U``, ``G = A'A`` and ``K = P H' L^-T``,
+have amounts x ~ N(0, `LASTS`^2) that last, where the filter has N(0, 1) at each tick. With its innovation nu
+of covariance ``V = L L'``, ``A = L^-1 U``, ``G = A'A``, ``B = P H' L^-T A (I - G)^-1`` and C the posterior
+covariance of x,
 
-    C = (I / LASTS^2 + G (I - G)^-1)^-1,  mean C (I - G)^-1 A' L^-1 nu,  P <- P - K A U' - U A' K' + U C U'
+    C = (I / LASTS^2 + G (I - G)^-1)^-1,   x = C (I - G)^-1 A' L^-1 nu,
+    r - (w + b) <- r - (w + b) - B (A' L^-1 nu - x) - U x,   P <- P - B (I - G) B' + (B - U) C (B - U)'
 
 A meter agrees after n readings in turn within `OUTLIER` standard deviations, if their mean is within `AGREES`
 of its own. n is at least `RELEASE`, and ``d <= n P``: more readings would hardly sharpen the comparison.
@@ -20,8 +22,10 @@ set J may go on with the amounts a last seen, each within `VARIES` of itself:
 
     cost(J) = (o - a_J)' (S + VARIES^2 diag(a_J)^2)^-1 (o - a_J)
 
-A meter is released if the least cost of the sets without it is below that of the sets with it by 2 `HONEST`.
-Costs are minimised by single changes, from the empty set and from all meters: liars alike support each other.
+A meter is released if the least cost of the sets without it is below that of the sets with it by 2 `HONEST`,
+or if it has agreed for `LONG` readings in turn. Costs are minimised by single changes, from the empty set and
+from all meters: colluding ones support each other. The amount last seen is that of the search, or a smaller
+one of a reading that disagrees: a single larger reading does not make the usual amount implausible.
 After the release a meter is subject to the detector as any other.
 """
 
@@ -48,6 +52,8 @@ LASTS = 0.2
 """Standard deviation of a lasting error along an unknown direction, in that of one tick of the filter, 1."""
 VARIES = 0.25
 """Change of a manipulation that goes on, in standard deviations per amount last seen, 1."""
+LONG = 600
+"""Readings in turn that agree after which a meter is released in any case: ten minutes at one per second."""
 HONEST = 2.0
 """Least logarithm of the ratio of likelihoods, honest to manipulated, of a release, 1: odds of seven."""
 
@@ -61,32 +67,37 @@ class Masked:
     meters : (t,)
         The masked ones.
     count : (t,)
-        Readings in turn that agree.
+        Readings in turn that agree, since the last comparison of their mean.
     total : (t,)
         Sum of their deviations, squared pu.
     amount : (t,)
-        Manipulation as last seen, squared pu: by the search, later by readings that disagree. 0: not seen.
+        Manipulation as last seen, squared pu; 0: not seen, and agreement is enough.
+    turn : (t,)
+        Readings in turn that agree.
     """
 
     meters: Bools
     count: Ints
     total: Floats
     amount: Floats
+    turn: Ints
 
 
 def none(modes: Modes) -> Masked:
     """No masked meter."""
-    t = modes.size
-    return Masked(np.zeros(t, dtype=np.bool_), np.zeros(t, dtype=np.intp), np.zeros(t), np.zeros(t))
+    count, total = np.zeros(modes.size, dtype=np.intp), np.zeros(modes.size)
+    return Masked(np.zeros(modes.size, dtype=np.bool_), count, total, total, count)
 
 
 def added(masked: Masked, meters: Bools, amount: Floats | float = 0.0) -> Masked:
-    """The same with more meters (t,) and their amounts, squared pu (t,); their count starts at 0."""
+    """The same with more meters (t,), their count at 0, and their amounts, squared pu (t,), where not 0."""
+    before = np.where(masked.meters, masked.amount, 0.0)
     return Masked(
         masked.meters | meters,
         np.where(meters, 0, masked.count),
         np.where(meters, 0.0, masked.total),
-        np.where(meters, amount, masked.amount),
+        np.where(meters & (np.asarray(amount) != 0.0), amount, before),
+        np.where(meters, 0, masked.turn),
     )
 
 
@@ -129,7 +140,10 @@ def follow(  # noqa: PLR0917  # the masked meters, and one tick
     mean, full_count = total / n, count >= MOST
     agrees = read & (full_count | ((count >= RELEASE) & (d <= n * wide)))
     agrees &= mean**2 <= AGREES**2 * (wide + d / n)
-    released, amount = agrees & (masked.amount == 0.0), np.where(read & ~fits, off, masked.amount)
+    turn = np.where(read, np.where(fits, masked.turn + 1, 0), masked.turn)
+    released, amount = agrees & ((masked.amount == 0.0) | (turn >= LONG)), masked.amount
+    smaller = read & ~fits & ((amount == 0.0) | (np.abs(off) < np.abs(amount)))
+    amount = np.where(smaller, off, amount)
     if any_of(agrees & ~released):
         some = agrees[at]
         least = np.sqrt(n[agrees])
@@ -140,6 +154,7 @@ def follow(  # noqa: PLR0917  # the masked meters, and one tick
         np.where(full_count, 0, count),
         np.where(full_count, 0.0, total),
         amount,
+        turn,
     )
 
 
@@ -159,14 +174,17 @@ def deviations(
     off, P = m - full.mean[0] - full.mean[1], w + both + both.T + b
     if unknown is None or tick is None:
         return off, P
-    U, t = unknown[at], full.seen.size
+    if not tick.rows.size:
+        return off, P + LASTS**2 * (unknown[at] @ unknown[at].T)
+    t, one = full.seen.size, np.eye(unknown.shape[1])
     A, _ = lapack.dtrtrs(tick.half, unknown[tick.rows], lower=True)
     G = A.T @ A
-    # What the other readings tell about the amounts, without the white part that the filter gives them.
-    alone = np.linalg.inv(np.eye(len(G)) - G)
-    C = np.linalg.inv(np.eye(len(G)) / LASTS**2 + G @ alone)
-    both = ((tick.gain[:t] + tick.gain[t:])[at] @ A) @ U.T
-    return off - unknown @ (C @ alone @ (A.T @ tick.white)), P - both - both.T + U @ C @ U.T
+    alone, pull = np.linalg.inv(one - G), A.T @ tick.white
+    C = np.linalg.inv(one / LASTS**2 + G @ alone)
+    B, amounts = (tick.gain[:t] + tick.gain[t:]) @ (A @ alone), C @ (alone @ pull)
+    apart = (B - unknown)[at]
+    off = off - B @ (pull - amounts) - unknown @ amounts
+    return off, P - B[at] @ (one - G) @ B[at].T + apart @ C @ apart.T
 
 
 def evidence(S: Floats, mean: Floats, amount: Floats) -> Floats:

@@ -36,7 +36,7 @@ from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.doubts import Movements, Unknown
 from gridsec.estimators.modal.estimate import Reconstructed, Spread
-from gridsec.estimators.modal.naming import CONFIRM, final
+from gridsec.estimators.modal.naming import CONFIRM, alone, final
 from gridsec.estimators.modal.record import Record
 from gridsec.estimators.modal.search import DOUBT
 from gridsec.estimators.plant import Plant, nothing_new
@@ -354,7 +354,8 @@ def _identified(
     """State after a search, if one is due, with the confirmed meters masked."""
     kernel, tick = design.core, state.front.ticks
     suspicion, pinned = state.suspicion, state.core.detector.pinned
-    if suspicion is not None and not pinned[suspicion.row]:
+    models = max(1, len(state.core.rivals))
+    if suspicion is not None and not (pinned[suspicion.row] and len(suspicion.found.problems) == models):
         suspicion = None
     if not any_of(pinned):
         return _unsuspected(state), evidence
@@ -381,10 +382,9 @@ def _identified(
     )
     since = () if any_of(masked) else state.core.history.readings[-age:]
     sure = final(suspicion.found, named, streak, since, kernel.near.laterals)
-    best = np.flatnonzero(suspicion.found.chosen[0])
-    if suspicion.fits and np.isin(best, np.flatnonzero(masked)).all():
-        # Masked meters alone, which were manipulated before they were masked.
-        sure = masked & suspicion.found.chosen[0, : masked.size]
+    if suspicion.fits and not any_of(sure):
+        # Masked meters alone may have been manipulated before they were masked.
+        sure = alone(suspicion.found, masked)
     if any_of(sure):
         found = replace(suspicion.found, named=sure)
         now, evidence = core.mask(kernel, state.core, replace(suspicion, found=found))

@@ -89,6 +89,24 @@ def confirmed(found: Identification, named: Bools, streak: Ints, since: Sequence
     return np.asarray(named & (streak >= least))
 
 
+def alone(found: Identification, masked: Bools) -> Bools:
+    """Masked meters that explain the readings by themselves, as the likeliest set has them, (p,).
+
+    None where sets with other faults weigh more than 1 - `SURE`.
+
+    Parameters
+    ----------
+    found
+        What a search found.
+    masked : (p,)
+        The masked meters.
+    """
+    others = found.chosen.copy()
+    others[:, : masked.size] &= ~masked
+    sure = found.weight[~others.any(axis=1)].sum() >= SURE
+    return np.asarray(masked & found.chosen[0, : masked.size] & sure)
+
+
 def separable(found: Identification, which: Bools, laterals: Bools) -> bool:
     """The rest of the likeliest explanation is doubtful, or stays likely where some of its meters are masked.
 

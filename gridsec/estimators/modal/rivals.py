@@ -178,31 +178,7 @@ def replayed(
     onsets, row
         The onsets of the detector after the last reading, and the row of the onset.
     """
-    return _replayed(first(modes, others, history), history, onsets, row)
-
-
-def transitions(modes: Modes, history: History, onsets: Onsets, row: int) -> tuple[Rival, ...]:
-    """The model itself with transitions of 1, 2, 4, ... ticks, shorter than the onset's age.
-
-    None for an onset before the kept readings.
-
-    Parameters
-    ----------
-    modes, history, onsets, row
-        As in `replayed`.
-    """
-    age, (plain,) = int(onsets.age[row]), first(modes, (), history)
-    if age > len(history.readings):
-        return ()
-    spans = 1 << np.arange((age - 1).bit_length())
-    return _replayed([replace(plain, transition=int(span)) for span in spans], history, onsets, row)
-
-
-def _replayed(before: list[Rival], history: History, onsets: Onsets, row: int) -> tuple[Rival, ...]:
-    """Rivals after the last reading, with the scores of one onset, from those before the first one."""
-    if not before:
-        return ()
-    modes, (state, _, test, suspected) = before[0].modes, history.start
+    state, _, test, suspected = history.start
     count, age, had = len(history.readings), int(onsets.age[row]), detector.followed(modes, test).onsets
     older = bool(had.used[row]) and int(had.age[row]) == age - count
     exactly = next((each for each in suspected if older and each.row == row), None)
@@ -210,21 +186,37 @@ def _replayed(before: list[Rival], history: History, onsets: Onsets, row: int) -
     one = signatures.empty(modes, int(not onsets.ramp[row]), int(onsets.ramp[row]))
     if older and (state.full is None or exactly is not None):
         begin, one = -1, signatures.single(had, row)
-    out, apart = [replace(each, onsets=one, suspected=exactly) for each in before], APART * np.eye(modes.size)
+    out = [replace(each, onsets=one, suspected=exactly) for each in first(modes, others, history)]
     for k, (t, m, seen, unknown, jump) in enumerate(history.readings):
-        within = apart if unknown is None else np.hstack([unknown, apart])
-        out = [
-            follow(
-                each,
-                t,
-                m,
-                seen,
-                within if begin <= k < begin + each.transition else unknown,
-                jump,
-                begun=k == begin,
-            )
-            for each in out
-        ]
+        out = [follow(each, t, m, seen, unknown, jump, begun=k == begin) for each in out]
+    return tuple(out)
+
+
+def transitions(modes: Modes, history: History, onsets: Onsets, row: int) -> tuple[Rival, ...]:
+    """The model itself with transitions of 1, 2, 4, ... ticks, shorter than the onset's age.
+
+    The misfit begins with the transition's end. None for an onset before the kept readings.
+
+    Parameters
+    ----------
+    modes, history, onsets, row
+        As in `replayed`.
+    """
+    age, count, out = int(onsets.age[row]), len(history.readings), list[Rival]()
+    if age > count:
+        return ()
+    (within,) = first(modes, (), history)
+    one = signatures.empty(modes, int(not onsets.ramp[row]), int(onsets.ramp[row]))
+    within, apart = replace(within, onsets=one), APART * np.eye(modes.size)
+    for k, (t, m, seen, unknown, jump) in enumerate(history.readings, age - count):
+        out = [follow(each, t, m, seen, unknown, jump) for each in out]
+        if k < 0:
+            within = follow(within, t, m, seen, unknown, jump)
+        elif k < age - 1:
+            wide = apart if unknown is None else np.hstack([unknown, apart])
+            within = follow(within, t, m, seen, wide, jump, begun=k == 0)
+            if (k + 1) & k == 0:
+                out.append(replace(within, transition=k + 1, misfit=0.0, count=0))
     return tuple(out)
 
 

@@ -78,6 +78,38 @@ def test_a_release_takes_readings_until_their_mean_is_sharp(kernel: Core, noise:
     assert masked.meters[FIRST]
 
 
+def test_the_amount_of_a_ramp_is_that_of_the_reading(kernel: Core) -> None:
+    """A drift of 5e-5 squared pu per tick, named 30 ticks or more after its onset."""
+    source, state, lie = Source(MODEL, np.random.default_rng(1)), core.init(kernel, 0.0), 0.0
+    for k in range(400):
+        lie = 5e-5 * max(0, k - 200)
+        state, evidence = core.step(kernel, state, float(k), source.tick() + lie * np.eye(12)[FIRST])
+        if core.alarmed(kernel, evidence):
+            suspicion = core.identify(kernel, state, evidence)
+            if suspicion.found.named[FIRST] and state.detector.onsets.ramp[suspicion.row]:
+                break
+    state, _ = core.mask(kernel, state, suspicion)
+    assert 0.5 * lie < state.masked.amount[FIRST] < 2.0 * lie
+
+
+def test_a_single_reading_replaces_no_smaller_amount(kernel: Core) -> None:
+    """A lie within a wide deviation, and one reading at 20 times the lie; repeated readings keep it."""
+    p, meter = kernel.modes.size, np.eye(12)[FIRST]
+    none, quiet = np.zeros((p, p)), SimpleNamespace(noise=1e-7 * np.eye(p))
+    posterior = SimpleNamespace(mean=np.zeros((2, p)), blocks=(1e-5 * np.eye(p), none, none))
+    lie = 2.5 * np.sqrt(1e-5) * meter
+    masked = masking.added(masking.none(kernel.modes), meter > 0.0, lie)
+    for k in range(10 * masking.MOST):
+        masked = masking.follow(quiet, masked, posterior, None, (20.0 if k == 30 else 1.0) * lie, None)
+        if k == 60:
+            masked = masking.added(masked, meter > 0.0)
+    assert masked.meters[FIRST]
+    # Agreement for very long releases it in any case.
+    for _ in range(masking.LONG):
+        masked = masking.follow(quiet, masked, posterior, None, lie, None)
+    assert not masked.meters[FIRST]
+
+
 def test_deviations_beside_unknown_directions(kernel: Core) -> None:
     """Oracle: the dense joint law of w + b, the lasting amounts and the readings of one tick."""
     random, modes, p = np.random.default_rng(5), kernel.modes, 12
@@ -91,18 +123,17 @@ def test_deviations_beside_unknown_directions(kernel: Core) -> None:
     w, both, b = before.blocks
     prior = rho**2 * w + rho * rho_b * (both + both.T) + rho_b**2 * b
     prior += (1.0 - rho**2) * modes.covariance_w + (1.0 - rho_b**2) * modes.covariance_b
-    # The filter's own law of w + b, with wide amounts; the lasting amounts by the law without that part.
-    of, wide = prior[:, rows], unknown[rows] @ unknown[rows].T
-    alone = prior[np.ix_(rows, rows)] + modes.noise[np.ix_(rows, rows)]
-    U, nu = unknown[rows], m[rows]
-    C = np.linalg.inv(np.eye(3) / masking.LASTS**2 + U.T @ np.linalg.solve(alone, U))
-    amounts = C @ U.T @ np.linalg.solve(alone, nu)
-    posterior = prior - of @ np.linalg.solve(alone + wide, of.T)
-    with_amounts = -of @ np.linalg.solve(alone + wide, U) @ unknown.T
-    found = posterior + with_amounts + with_amounts.T + unknown @ C @ unknown.T
-    mean = of @ np.linalg.solve(alone + wide, nu)
-    assert pytest.approx(found[np.ix_(at, at)], rel=1e-9, abs=1e-15) == P
-    assert off[at] == pytest.approx((m - mean - unknown @ amounts)[at], rel=1e-9)
+    # Joint law of the readings of all members, with lasting amounts; white errors of both parts independent.
+    noise = modes.noise * np.equal.outer(seen, seen)
+    joint = prior + noise + masking.LASTS**2 * unknown @ unknown.T
+    gain = np.linalg.solve(joint[np.ix_(rows, rows)], joint[np.ix_(rows, at)]).T
+    found = (joint - noise)[np.ix_(at, at)] - gain @ joint[np.ix_(rows, at)]
+    assert pytest.approx(found, rel=1e-8, abs=1e-15) == P
+    assert off[at] == pytest.approx(m[at] - gain @ m[rows], rel=1e-8)
+    # A tick without any reading.
+    none, tick = full.updated(modes, before, gap, m, np.zeros(p, dtype=np.bool_), unknown)
+    _, P = masking.deviations(none, tick, m, at, unknown)
+    assert pytest.approx((joint - noise)[np.ix_(at, at)], rel=1e-9) == P
 
 
 def test_evidence_of_honesty_against_all_sets() -> None:

@@ -101,3 +101,13 @@ def test_a_part_is_masked_where_the_rest_is_doubtful_anyway() -> None:
     for weight, separable in ((0.04, False), (0.06, True)):
         found = two(given, all_meters, with_power, weight)
         assert naming.separable(found, mask(0, 1), NO_LATERALS) is separable
+
+
+def test_masked_meters_alone() -> None:
+    """The best set has masked meters only; a set with another one weighs 1 or 10 %."""
+    given, *_ = colluding()
+    for weight, sure in ((0.01, True), (0.1, False)):
+        found = two(given, mask(0, 1, size=9), mask(0, 3, size=9), weight)
+        assert (naming.alone(found, mask(0, 1, 2)) == (mask(0, 1) & sure)).all()
+    # A power is no masked meter.
+    assert not naming.alone(two(given, mask(0, 8, size=9), mask(0, 1, size=9), 0.01), mask(0, 1, 2)).any()
