@@ -92,7 +92,7 @@ def confirmed(found: Identification, named: Bools, streak: Ints, since: Sequence
 def alone(found: Identification, masked: Bools) -> Bools:
     """Masked meters that explain the readings by themselves, as the likeliest set has them, (p,).
 
-    None where sets with other faults weigh more than 1 - `SURE`.
+    None where sets with other faults are likelier. Readings of masked meters are lost, and no others.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def alone(found: Identification, masked: Bools) -> Bools:
     """
     others = found.chosen.copy()
     others[:, : masked.size] &= ~masked
-    sure = found.weight[~others.any(axis=1)].sum() >= SURE
+    sure = found.weight[~others.any(axis=1)].sum() >= KEEPS
     return np.asarray(masked & found.chosen[0, : masked.size] & sure)
 
 

@@ -104,9 +104,9 @@ def test_a_part_is_masked_where_the_rest_is_doubtful_anyway() -> None:
 
 
 def test_masked_meters_alone() -> None:
-    """The best set has masked meters only; a set with another one weighs 1 or 10 %."""
+    """The best set has masked meters only; a set with another one weighs a hundredth, or twice as much."""
     given, *_ = colluding()
-    for weight, sure in ((0.01, True), (0.1, False)):
+    for weight, sure in ((0.01, True), (2.0, False)):
         found = two(given, mask(0, 1, size=9), mask(0, 3, size=9), weight)
         assert (naming.alone(found, mask(0, 1, 2)) == (mask(0, 1) & sure)).all()
     # A power is no masked meter.
