@@ -8,6 +8,8 @@ import pytest
 from benchmarks._scenes import CLOCK_S, LATE_S, USUAL, Model, Setting, received
 from benchmarks.accusations import Run, cell, cells, run
 from feeders.model.site import Snapshot
+from feeders.registry import MODAL
+from gridsec.interface import Decision
 
 # Seeds with an honest meter accused before its mend come first.
 RUNS = [
@@ -72,3 +74,22 @@ def test_a_further_model_takes_the_place_of_all() -> None:
     assert {each[1] for each in cells("drift", model=Model.SILENT)} == {Model.SILENT}
     assert cells("drift", model=Model.LOADS) == cells("drift")
     assert {each[1] for each in cells("drift")} == set(USUAL)
+
+
+@pytest.mark.acceptance
+def test_manipulations_begin_by_clocks_that_are_off() -> None:
+    """39 of 118 meters begin one after another within six seconds: all are named, and no honest one."""
+    one = run("contiguous-low", 4, estimator=MODAL, model=Model.CLOCKS)
+    assert not one.accused
+    assert len(one.named) == len(one.manipulated) == 39
+    assert not one.decisions[Decision.CLEAN]
+
+
+@pytest.mark.acceptance
+def test_meters_within_a_wide_deviation_stay_named() -> None:
+    """Four meters off by 0.5 % beside an unread power: named once, and never CLEAN."""
+    one = run("contiguous-low", 200, estimator=MODAL)
+    assert not one.accused
+    assert one.settled < 5.0
+    assert one.decisions[Decision.ATTACKED] >= 85
+    assert not one.decisions[Decision.CLEAN]
