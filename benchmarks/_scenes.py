@@ -146,19 +146,16 @@ def received(setting: Setting, ticks: Sequence[Snapshot]) -> Iterator[Snapshot]:
     ticks
         Readings of the moment, one tick per second.
     """
-    every, last = np.arange(ticks[0].v_volt.size), len(ticks) - 1
-    offset = np.random.default_rng([setting.seed, 7]).integers(-CLOCK_S, CLOCK_S + 1, every.size)
-    late = setting.model is Model.LATE
+    every, late = np.arange(ticks[0].v_volt.size), setting.model is Model.LATE
+    behind = np.full(every.size, LATE_S)
+    if not late:
+        # A clock that is ahead tells the reading of an earlier moment.
+        behind = np.random.default_rng([setting.seed, 7]).integers(-CLOCK_S, CLOCK_S + 1, every.size)
     v, p, q = (np.array([getattr(one, k) for one in ticks]) for k in ("v_volt", "p_kw", "q_kvar"))
     for k, one in enumerate(ticks):
-        # A clock that is ahead tells the reading of an earlier moment.
-        of = np.clip(k - (LATE_S if late else offset), 0, last) + 0 * every
-        now = replace(one, p_kw=p[of, every], q_kvar=q[of, every])
-        yield (
-            replace(now, p_age_s=np.full(every.size, float(LATE_S)))
-            if late
-            else replace(now, v_volt=v[of, every])
-        )
+        of = np.clip(k - behind, 0, len(ticks) - 1)
+        other = {"p_age_s": behind.astype(np.float64)} if late else {"v_volt": v[of, every]}
+        yield replace(one, p_kw=p[of, every], q_kvar=q[of, every], **other)
 
 
 def play(

@@ -389,7 +389,7 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
     found, amount = suspicion.found, np.zeros(core.effect.shape[1])
     model, chosen = int(found.model[0]), found.chosen[0]
     # The amounts of a ramp are those of its unit of time.
-    joint = state.rivals[model].joint() if model else _joint(core, _parts(state), suspicion.row)
+    joint = _joint_under(core, state, suspicion.row, model)
     amount[chosen] = joint.level * mean_amounts(found.problems[model], chosen)
     return replace(now, masked=masking.added(state.masked, named, amount[: named.size])), evidence
 
@@ -654,6 +654,11 @@ def _joint(core: Core, parts: Parts, row: int) -> Joint:
     return signatures.joint(core.modes, detector.followed(core.modes, test).onsets, known, row)
 
 
+def _joint_under(core: Core, state: CoreState, row: int, model: int) -> Joint:
+    """Joint scores of one onset under a model by its number: 0, or that of a rival with its own onset."""
+    return state.rivals[model].joint() if model else _joint(core, _parts(state), row)
+
+
 def _searched(core: Core, state: CoreState, row: int, known: Bools | None) -> Identification:
     """Explanations since one onset, under the model and under its rivals."""
     open_ = _unknown(state)
@@ -724,7 +729,7 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     for model, filtered in enumerate((state.filter, *(each.filter for each in state.rivals[1:]))):
         used, moved = found.chosen[found.model == model].any(axis=0), np.zeros_like(core.effect)
         if used.any():
-            joint = state.rivals[model].joint() if model else _joint(core, _parts(state), suspicion.row)
+            joint = _joint_under(core, state, suspicion.row, model)
             W, effect = core.faults.W[:, used], core.effect[:, used]
             moved[:, used] = estimates.moves(made, by, filtered, joint, W, effect)
         T.append(moved)

@@ -210,7 +210,7 @@ def jump(
         # Unknown directions of every frame.
         level[np.tile(doubt.sudden_p > 0.0, 2)] = 0.0
     if frame.p_origin is not None and any_of(frame.p_origin):
-        # Powers that come back are compared with their last reading.
+        # Not all are `READ`, which is 0. Powers that come back are compared with their last reading.
         read = np.tile(frame.p_origin == PowerOrigin.READ, 2)
         level = np.where(read, level, np.nan if before is None else before.level)
     if before is None:
@@ -291,9 +291,10 @@ def _unsettled(
     error = droop.per_customer(injected, N) / np.sqrt(3.0)
     usually = design.injections + droop.per_customer(design.mismatch, N)
     far = error > UNSETTLED * np.maximum(usually, EXACT)
-    out = far & ~metered
+    out = far
     if any_of(free):
-        out |= (droop.per_customer(free.astype(np.float64), N) > 0.0) & ~metered
+        out = far | (droop.per_customer(free.astype(np.float64), N) > 0.0)
+    out = out & ~metered
     return (np.where(out, error, 0.0), np.where(far, WIDER, FOLLOWS)) if any_of(out) else None
 
 

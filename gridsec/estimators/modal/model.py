@@ -247,6 +247,11 @@ class Modes:
         return np.asarray(self.U * self.U)
 
     @cached_property
+    def volume(self) -> float:
+        """``log |det U|``: logarithm of a density of the readings less that of their values in the modes."""
+        return float(np.linalg.slogdet(self.U)[1])
+
+    @cached_property
     def noise(self) -> Floats:
         """Covariance D of the white errors of the members, (t, t)."""
         return self.model.noise(self.at)

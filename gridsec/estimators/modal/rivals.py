@@ -79,8 +79,6 @@ class Rival:
         the filter is modal, without theta.
     known
         Part of theta in the evidence that is subtracted: that before the first reading.
-    volume
-        ``log |det U|``, added at each tick in the modes: likelihoods are those of the meters' readings.
     onsets, suspected
         The onset, in row 0, in the modes, and its exact scores where readings have been missing.
     jumps
@@ -103,7 +101,6 @@ class Rival:
     static: Static
     sum: float
     known: float
-    volume: float
     onsets: Onsets
     suspected: Suspected | None
     jumps: int | None
@@ -157,9 +154,9 @@ def first(modes: Modes, others: Sequence[Modes], history: History) -> list[Rival
         The readings.
     """
     state, known, *_ = history.start
-    none, volume = signatures.empty(modes, 1), float(np.linalg.slogdet(modes.U)[1])
+    none = signatures.empty(modes, 1)
     return [
-        Rival(each, state, known, 0.0, _of_theta(each, known), volume, none, None, 0 if k else None)
+        Rival(each, state, known, 0.0, _of_theta(each, known), none, None, 0 if k else None)
         for k, each in enumerate((modes, *others))
     ]
 
@@ -263,7 +260,8 @@ def follow(  # noqa: PLR0917  # the state, and one tick
     if update.exact is None:
         count = modes.size
         total -= 0.5 * float((update.innovation**2 / update.variance + np.log(update.variance)).sum())
-        total += before.volume
+        # Likelihoods are those of the readings, as with a full covariance.
+        total += modes.volume
         if begun or onsets.used[0]:
             onsets = signatures.follow(modes, onsets, update, known, gap.h, begun=[0] if begun else [])
     else:
