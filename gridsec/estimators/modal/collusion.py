@@ -3,10 +3,10 @@
 The penalty of a set of meters is a prior: few are likelier than many. It may decide as long as one fault
 alone explains the readings. Where an explanation has several faults, or meters are masked already, an
 adversary has chosen the meters, and its choice has no prior. Let C be the accused meters of one sign in the
-likeliest explanation J, and L the cost without the penalty of meters. A set g of meters with one amount in
-place of C is an explanation of its own, at ``max(0, L((J - C) + g) - L(J))`` beyond J. It has other meters
-than C, or also some of C with the reverse sign. Let A be the meters of C that g lacks. They are not named
-where that is less than
+likeliest explanation J, or a phase of the busbar, and L the cost without the penalty of meters. A set g of
+meters with one amount in place of C is an explanation of its own, at ``max(0, L((J - C) + g) - L(J))`` beyond
+J. It has other meters than C, or also some of C with the reverse sign. Let A be the faults of C that g lacks.
+They are not named where that is less than
 
     max(2 log(1 / DOUBT), MISFIT (L(J - A) - L(J)))
 
@@ -95,7 +95,10 @@ def weighed(found: Identification, masked: Bools, near: Neighbourhoods) -> Ident
         Laterals, and the largest number of manipulated meters that is promised.
     """
     p, J = found.named.size, found.chosen[0]
-    named = found.named & ~masked
+    first = J.size - near.phases.shape[1]
+    named = np.zeros_like(J)
+    named[:p] = found.named & ~masked
+    named[first:] = found.weight @ ~found.chosen[:, first:] < DOUBT
     if not any_of(named) or (np.count_nonzero(J) == 1 and not any_of(masked)):
         return found
     most = max(near.most, p // 3)
@@ -104,19 +107,20 @@ def weighed(found: Identification, masked: Bools, near: Neighbourhoods) -> Ident
     model = int(found.model[0])
     problem, amount = found.problems[model], np.zeros(J.size)
     amount[J] = mean_amounts(problem, J)
-    by_model, contested = costs_of(found), np.zeros(p, dtype=np.bool_)
-    cases = []
-    for sign in _SIGNS:
-        # The onset may be older than that of a masked meter, which J then has, too.
-        accused = J[:p] & ~masked & (sign * amount[:p] > 0.0)
-        cases.append((_Case(problem, J, amount, accused, sign, masked, most, near.powers), SPLITS))
+    by_model, contested = costs_of(found), np.zeros_like(J)
+    # The onset may be older than that of a masked meter, which J then has, too.
+    fresh = J & (np.arange(J.size) < p)
+    fresh[:p] &= ~masked
+    sets = [fresh & (sign * amount > 0.0) for sign in _SIGNS]
+    sets += [np.arange(J.size) == k for k in np.flatnonzero(J[first:]) + first]
+    cases = [(_Case(problem, J, amount, each, masked, most, near.powers), SPLITS) for each in sets]
     while cases:
         case, splits = cases.pop()
         accused = case.accused
         if not any_of(accused & named):
             continue
         for more, other in case.contesting():
-            kept = accused & named & ~other[:p] & ~contested
+            kept = accused & named & ~other & ~contested
             if any_of(kept):
                 contested |= kept
                 # No more than J: few meters are likelier than many. What keeps names counts in the estimate.
@@ -128,7 +132,7 @@ def weighed(found: Identification, masked: Bools, near: Neighbourhoods) -> Ident
     if not any_of(contested):
         return found
     out = identified(found.problems, by_model)
-    return replace(out, named=out.named & ~contested)
+    return replace(out, named=out.named & ~contested[:p])
 
 
 _SIGNS = (1.0, -1.0)
@@ -136,7 +140,7 @@ _SIGNS = (1.0, -1.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Case:
-    """Accused meters C of one sign in an explanation. p meters, q faults.
+    """Accused faults C in an explanation: meters of one sign, or a phase of the busbar. p meters, q faults.
 
     Attributes
     ----------
@@ -144,10 +148,8 @@ class _Case:
         The problem of its model.
     J, amount : (q,), (q,)
         The explanation, and its amounts.
-    accused : (p,)
-        The meters C.
-    sign
-        Sign of their amounts.
+    accused : (q,)
+        The faults C.
     masked : (p,)
         Masked meters.
     most
@@ -160,7 +162,6 @@ class _Case:
     J: Bools
     amount: Floats
     accused: Bools
-    sign: float
     masked: Bools
     most: int
     powers: Ints
@@ -168,21 +169,31 @@ class _Case:
     @property
     def rest(self) -> Bools:
         """The explanation without C, (q,)."""
-        return _without(self.J, self.accused)
+        return self.J & ~self.accused
+
+    @property
+    def meters(self) -> Bools:
+        """The meters of C, (p,)."""
+        return self.accused[: self.problem.meters]
+
+    @property
+    def sign(self) -> float:
+        """Sign of their amounts."""
+        return float(np.sign(self.amount[self.accused][0]))
 
     def contesting(self) -> list[tuple[float, Bools]]:
         """Differences of L from J, and sets (q,) that keep names of C: those without any of C, then by L."""
         own, without = self.own()
         limit = own + max(_LEAST, MISFIT * (without - own))
         found = [
-            (any_of(self.accused & one[1][: self.accused.size]), *one)
+            (any_of(self.accused & one[1]), *one)
             for one in chain(self.instead(without, limit), self.customers())
             if one[0] < limit
         ]
         if not found:
             return []
         found.sort(key=lambda one: one[:2])
-        lacking = [_without(self.J, self.accused & ~other[: self.accused.size]) for *_, other in found]
+        lacking = [self.J & ~(self.accused & ~other) for *_, other in found]
         more = [max(0.0, each - own) for _, each, _ in found]
         alone = _evidence(self.problem, np.stack(lacking)) - own
         near = more < np.maximum(_LEAST, MISFIT * alone)
@@ -192,7 +203,9 @@ class _Case:
         """L of the explanation, with one amount of C where that is less, and without C."""
         problem, rest = self.problem, self.rest
         whole, without = _evidence(problem, np.stack([self.J, rest])).tolist()
-        at, y, F = _beside(problem, rest, self.accused)
+        if not any_of(self.meters):
+            return whole, without
+        at, y, F = _beside(problem, rest, self.meters)
         every = np.ones((1, at.size), dtype=np.bool_)
         alike = _OneSign(self.sign * y, F, float(problem.std[0]) ** 2, every).cost[0]
         return min(whole, without + alike), without
@@ -206,14 +219,14 @@ class _Case:
             L of the explanation without C, and the limit that L of a set is to fall below.
         """
         problem, p, rest, masked = self.problem, self.problem.meters, self.rest, self.masked
-        size = float(np.abs(self.amount[:p][self.accused]).mean())
+        size = float(np.abs(self.amount[self.accused]).mean())
         yield without, rest
         kept = []
         for each, signs in self._beginnings():
             at, y, F = _beside(problem, each, ~each[:p])
             room = self.most - int(np.count_nonzero(each[:p] | masked))
             begun = without if np.array_equal(each, rest) else float(_evidence(problem, each[None])[0])
-            s2, own = float(problem.std[0]) ** 2, self.accused[at]
+            s2, own = float(problem.std[0]) ** 2, self.meters[at]
             for sign in signs:
                 relaxed = _Relaxed(sign * y, F, s2, ~masked[at], room)
                 # The best set without any of them may keep more names.
@@ -231,9 +244,9 @@ class _Case:
 
     def _beginnings(self) -> list[tuple[Bools, tuple[float, ...]]]:
         """Sets that others are added to, (q,), and the signs of these: the rest, and parts of it."""
-        p, rest = self.problem.meters, self.rest
-        fewer: list[tuple[Bools, tuple[float, ...]]] = [(rest & (np.arange(rest.size) < p), _SIGNS)]
-        fewer += [(_without(rest, sign * self.amount[:p] > 0.0), (sign,)) for sign in _SIGNS]
+        rest, meter = self.rest, np.arange(self.J.size) < self.problem.meters
+        fewer: list[tuple[Bools, tuple[float, ...]]] = [(rest & meter, _SIGNS)]
+        fewer += [(rest & ~(meter & (sign * self.amount > 0.0)), (sign,)) for sign in _SIGNS]
         return [(rest, _SIGNS), *(one for one in fewer if not np.array_equal(one[0], rest))]
 
     def customers(self) -> Iterator[tuple[float, Bools]]:
@@ -246,7 +259,7 @@ class _Case:
         charge[powers] = 0.0
         free, chosen = replace(problem, charge=charge), rest & (np.arange(rest.size) < p)
         # The powers of masked customers are free, too.
-        least, usable = float(_evidence(free, chosen[None])[0]), (informed(problem) | masked) & ~self.accused
+        least, usable = float(_evidence(free, chosen[None])[0]), (informed(problem) | masked) & ~self.meters
         while True:
             added = np.flatnonzero(usable & ~chosen[powers])
             sets = np.repeat(chosen[None], added.size, axis=0)
@@ -264,21 +277,19 @@ class _Case:
             yield least, chosen
 
 
-def _split(meters: Bools, laterals: Bools) -> tuple[Bools, ...]:
-    """Meters (p,) inside and outside of the lateral (g, p) with most of them, but not all; () for none."""
-    inside = np.count_nonzero(laterals & meters, axis=1)
-    inside[inside == np.count_nonzero(meters)] = 0
+def _split(accused: Bools, laterals: Bools) -> tuple[Bools, ...]:
+    """Accused faults (q,) inside and outside of the lateral (g, p) with most meters of them, but not all.
+
+    () for none.
+    """
+    p = laterals.shape[1]
+    inside = np.count_nonzero(laterals & accused[:p], axis=1)
+    inside[inside == np.count_nonzero(accused)] = 0
     if not any_of(inside):
         return ()
-    one = laterals[inside.argmax()]
-    return meters & one, meters & ~one
-
-
-def _without(chosen: Bools, meters: Bools) -> Bools:
-    """The set (q,) without some meters, (p,)."""
-    out = chosen.copy()
-    out[: meters.size] &= ~meters
-    return out
+    one = np.zeros_like(accused)
+    one[:p] = laterals[inside.argmax()]
+    return accused & one, accused & ~one
 
 
 def _evidence(problem: SearchProblem, sets: Bools) -> Floats:

@@ -14,7 +14,7 @@ from gridsec.arrays import Bools, Floats
 from gridsec.estimators.modal import collusion
 from gridsec.estimators.modal.costs import SearchProblem, cost, costs, penalties
 from gridsec.estimators.modal.mirrors import Neighbourhoods
-from gridsec.estimators.modal.search import ALIKE, Identification
+from gridsec.estimators.modal.search import ALIKE, DOUBT, Identification
 from tests.gridsec.estimators.modal.test_search import problem
 
 METERS, NOISE, SHARED = 12, 0.01, 3.0
@@ -61,6 +61,7 @@ def some(*meters: int) -> Bools:
 
 NONE = some()
 OWN = METERS + np.arange(METERS)
+NOT_FIRST = ~some(0, 1, 2, 3)
 
 
 def test_the_evidence_is_the_cost_without_the_penalty_of_meters() -> None:
@@ -296,6 +297,35 @@ def test_meters_without_readings_replace_nothing() -> None:
     assert not contested(explanation(silent, some(0, 6)), NONE, 4).any()
 
 
+def busbar(lie: Floats) -> SearchProblem:
+    """Scores of a lie, (p,): loads move the meters 4 to 11 alike, and the busbar's meter all of them."""
+    V = NOISE * np.eye(METERS) + SHARED * np.outer(NOT_FIRST, NOT_FIRST)
+    W = np.hstack([np.eye(METERS), -np.ones((METERS, 1))])
+    F, y = W.T @ np.linalg.solve(V, W), W.T @ np.linalg.solve(V, lie)
+    charge = np.append(np.zeros(METERS), 5.0)
+    return SearchProblem(y, F, np.ones(METERS + 1), METERS, charge, np.full(METERS + 1, inf))
+
+
+@pytest.mark.parametrize(("most", "named"), [(5, False), (4, True)])
+def test_colluding_meters_contest_the_meter_of_the_busbar(most: int, named: bool) -> None:
+    """Four meters are off by one amount: beside a fifth the busbar is named only if five are not promised."""
+    given = busbar(0.8 * ~NOT_FIRST + 2.0 * some(6))
+    out = collusion.weighed(explanation(given, some(6), power=True), NONE, near(most))
+    assert (out.weight @ ~out.chosen[:, -1] < DOUBT) == named
+    assert (out.named == some(6)).all()
+    sets = [np.append(some(6), True), np.append(some(0, 1, 2, 3, 6), False)]
+    assert {each.tobytes() for each in out.chosen} == {each.tobytes() for each in sets[: 2 - named]}
+
+
+def test_a_sole_fault_of_the_busbar_is_left_to_the_prior() -> None:
+    """Without masked meters it is likelier than four meters; beside a masked one it is contested."""
+    given = busbar(0.8 * ~NOT_FIRST)
+    one = explanation(given, NONE, power=True)
+    assert collusion.weighed(one, NONE, near(5)) is one
+    out = collusion.weighed(one, some(11), near(5))
+    assert out.weight @ ~out.chosen[:, -1] >= DOUBT
+
+
 def customers(lie: Floats, powers: Floats, charge: float = 5.0) -> SearchProblem:
     """Scores of false readings (p,) and powers (p,): power 1 moves as meter 4 and power 7 beside meter 1."""
     V = NOISE * np.eye(METERS) + SHARED * np.kron(np.eye(2), np.ones((6, 6)))
@@ -323,7 +353,7 @@ def test_customers_with_false_powers_contest_an_honest_meter() -> None:
 def instead_of_four(given: SearchProblem, rest: np.ndarray) -> list[tuple[float, np.ndarray]]:
     """Customers in place of meter 4, beside the rest; at most 4 meters are promised."""
     J = rest | np.append(some(4), NONE)
-    case = collusion._Case(given, J, 1.0 * J, some(4), 1.0, NONE, 4, OWN)
+    case = collusion._Case(given, J, 1.0 * J, np.append(some(4), NONE), NONE, 4, OWN)
     assert (case.rest == rest).all()
     return list(case.customers())
 
