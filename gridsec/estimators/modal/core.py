@@ -73,6 +73,12 @@ EXPLAINED = 0.25
 
 A lasting fault explains all of it, one that grows since the onset three quarters, and alternating ones none.
 """
+SETTLED = 0.9
+"""Share from which on no transition is looked for, and below which none counts, 1.
+
+Faults that grow or begin one after another leave the rest to a transition. Beside one nothing is left but
+chance, and the first ticks of late ones.
+"""
 BY_CHANCE = 3.0
 """Misfit that needs no explanation, in standard deviations of n honest innovations, ``sqrt(2 n)``, 1."""
 OFTEN = 0.3
@@ -514,11 +520,14 @@ class Suspicion:
         The explanations.
     fits
         The best one explains the misfit since then, and better than errors alike within the classes.
+    settled
+        It explains nearly all of it.
     """
 
     row: int
     found: Identification
     fits: bool = True
+    settled: bool = True
 
 
 def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion | None = None) -> Suspicion:
@@ -550,28 +559,31 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
         found = _searched(core, state, rows[best], known)
     found = collusion.weighed(mirrors.reflected(found, core.near), state.masked.meters, core.near)
     age = int(test.onsets.age[rows[best]])
-    fits = _fits(state, found, age) and not (age >= test.ticks and _aligned(core, found))
-    return Suspicion(rows[best], found if fits else replace(found, named=np.zeros_like(found.named)), fits)
+    share = _explained(state, found, age)
+    fits = share >= EXPLAINED and not (age >= test.ticks and _aligned(core, found))
+    found = found if fits else replace(found, named=np.zeros_like(found.named))
+    return Suspicion(rows[best], found, fits, fits and share >= SETTLED)
 
 
-def _fits(state: CoreState, found: Identification, age: int) -> bool:
-    """The best explanation takes enough of the misfit away, by the model of the loads or a steady rival.
+def _explained(state: CoreState, found: Identification, age: int) -> float:
+    """Share of the misfit beyond chance that the best explanation takes away.
 
-    Of an onset before the kept readings, a gain in proportion to their number is compared.
+    The model is that of the loads, a steady rival, or from `SETTLED` on a transition. Of an onset before the
+    kept readings, a gain in proportion to their number is compared.
     """
-    if not state.rivals:
-        return True
-    for at in dict.fromkeys((0, int((found.model == 0).argmax()))):
+    best = 0.0 if state.rivals else 1.0
+    for at in dict.fromkeys((0, int((found.model == 0).argmax()))) if state.rivals else ():
         number, chosen = int(found.model[at]), found.chosen[at]
         problem, model = found.problems[number], state.rivals[number]
         if model.transition and not any_of(chosen):
             continue
         # Twice the logarithm of a ratio of likelihoods.
         gain = float(problem.y[chosen] @ mean_amounts(problem, chosen)) * min(1.0, model.ticks / age)
-        chance = BY_CHANCE * sqrt(2.0 * model.count)
-        if gain >= EXPLAINED * (model.misfit - chance) and (number == 0 or model.unsteady < OFTEN):
-            return True
-    return False
+        beyond = model.misfit - BY_CHANCE * sqrt(2.0 * model.count)
+        share = gain / beyond if beyond > 0.0 else 1.0
+        if (number == 0 or model.unsteady < OFTEN) and not (model.transition and share < SETTLED):
+            best = max(best, share)
+    return best
 
 
 def _aligned(core: Core, found: Identification) -> bool:
@@ -590,7 +602,7 @@ def _aligned(core: Core, found: Identification) -> bool:
 
 
 def transition(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
-    """Add a rival with a transition since the onset, where no explanation fits and it is the likeliest one.
+    """Add a rival with a transition since the onset, where the misfit is not settled and it is the likeliest.
 
     An earlier one is replaced. The state is unchanged where another model is likelier. Older onsets are tried
     at about every fifth part of their age.
@@ -603,7 +615,7 @@ def transition(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
         The explanations after the same tick.
     """
     age = int(state.detector.onsets.age[suspicion.row])
-    if suspicion.fits or not state.rivals or age % max(1, age // TRIALS):
+    if suspicion.settled or not state.rivals or age % max(1, age // TRIALS):
         return state
 
     def cost_of(rival: Rival) -> float:

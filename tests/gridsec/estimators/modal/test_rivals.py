@@ -134,6 +134,28 @@ def test_manipulations_that_begin_one_after_another() -> None:
     assert core.adopt(kernel, state, suspicion) is state
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_transition_that_ends_too_early_names_nothing(seed: int) -> None:
+    """Four meters, one more at every other tick. The last one begins after a transition of four ticks."""
+    kernel = core.assemble(MODEL, STEPS_OF_PLACES, np.full(12, 0.1), gamma=1e6)
+    source, state = Source(MODEL, np.random.default_rng(seed)), core.init(kernel, 0.0)
+    liars, named, settled = np.arange(12) % 3 == 1, list[int](), list[bool]()
+    for k in range(213):
+        m = source.tick() + 0.06 * (liars & (2 * np.cumsum(liars) <= k - 198))
+        state, evidence = core.step(kernel, state, float(k), m)
+        if k >= 205:
+            suspicion = core.identify(kernel, state, evidence)
+            after = core.transition(kernel, state, suspicion)
+            if after is not state:
+                state, suspicion = after, core.identify(kernel, after, evidence)
+            assert suspicion.fits or not suspicion.found.named.any()
+            assert not (suspicion.found.named & ~liars).any()
+            named.append(int(suspicion.found.named.sum()))
+            settled.append(suspicion.settled)
+    assert named == [3, 0, 0, 0, 4, 4, 4, 4]
+    assert settled == [True, False, False, False, True, True, True, True]
+
+
 STEPS_OF_PLACES = np.vstack([np.zeros((1, 12)), STEPS])
 
 
