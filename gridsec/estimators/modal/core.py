@@ -552,7 +552,7 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     found = _searched(core, state, rows[0], known)
     std, costs = found.problems[0].std, []
     for row in rows:
-        problem, gain = _problem(core, _joint(core, _parts(state), row), _unknown(state))
+        problem, gain = _problem(core, _joint(core, _parts(state), row), state.history.unknown)
         costs.append(cost(replace(problem, std=std), found.chosen[0]) - 2.0 * gain)
     best = int(np.argmin(costs))
     if best:
@@ -638,11 +638,6 @@ def _keeping(found: Identification) -> Bools:
     )
 
 
-def _unknown(state: CoreState) -> Floats | None:
-    """Unknown directions of the last tick, (p, k)."""
-    return state.history.readings[-1][3] if state.history.readings else None
-
-
 def _misfit(core: Core, joint: Joint) -> float:
     """Cost of faults of all members at one onset, without the penalty; O(t^3).
 
@@ -673,7 +668,7 @@ def _joint_under(core: Core, state: CoreState, row: int, model: int) -> Joint:
 
 def _searched(core: Core, state: CoreState, row: int, known: Bools | None) -> Identification:
     """Explanations since one onset, under the model and under its rivals."""
-    open_ = _unknown(state)
+    open_ = state.history.unknown
     model, gain = _problem(core, _joint(core, _parts(state), row), open_)
     if not state.rivals:
         return search(model, core.groups, (), core.near.laterals, known)

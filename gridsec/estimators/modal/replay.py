@@ -91,6 +91,11 @@ class History:
     middle: Parts | None = field(default=None, repr=False)
     recent: tuple[tuple[int, Parts], ...] = field(default=(), repr=False)
 
+    @property
+    def unknown(self) -> Floats | None:
+        """Unknown directions of the last tick, (p, k)."""
+        return self.readings[-1][3] if self.readings else None
+
     def until(self, count: int) -> tuple[History, Parts]:
         """The history up to a kept state, the latest one after at most `count` readings, and this state."""
         states = [(0, self.start), *self.recent]

@@ -108,8 +108,11 @@ def meter_evidence(  # noqa: PLR0917  # the core, one tick, and one limit
         # A meter released at this tick was not read.
         tested = tested | (seen & ~update.seen)
     masked = None
-    if any_of(state.masked.meters) and state.filter.full is not None:
-        masked = (state.masked.meters, *deviations(core, state, m))
+    if any_of(state.masked.meters) and state.filter.full is not None and update is not None:
+        at, std, unknown = indices(state.masked.meters), np.zeros(seen.size), state.history.unknown
+        off, P = masking.deviations(state.filter.full, update.exact, m, at, unknown)
+        std[at] = np.sqrt(P.diagonal() + made.noise.diagonal()[at])
+        masked = state.masked.meters, off, std
         tested = tested | (state.masked.meters & seen)
     one, capital = signatures.single(test.onsets, row), float(test.capital[0, row])
     return MeterEvidence(tested, _Amounts(core, one, test.waiting, state.static, capital, seen, masked))
@@ -125,7 +128,7 @@ class _Amounts:
     static: Static  # information about the directions
     capital: float  # its logarithm
     seen: Bools  # (p,) meters with a reading
-    # masked meters, with the deviations of their readings from the filter and the standard deviations
+    # masked meters, with the deviations of their readings from the filter, as their release has them
     masked: tuple[Bools, Floats, Floats] | None
 
     def __call__(self) -> tuple[Floats, Floats]:

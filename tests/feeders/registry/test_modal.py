@@ -17,7 +17,7 @@ from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.arrays import Floats
 from gridsec.attack import Attack, Scaling
 from gridsec.errors import NotObservable
-from gridsec.estimators.modal import full, monitor, verdict
+from gridsec.estimators.modal import full, masking, monitor, verdict
 from gridsec.interface import Cause, Decision, Estimate, Frame, PowerOrigin, Verdict
 
 ONSET, LIARS, LIE = 40, np.array([2, 5, 9]), 0.02
@@ -91,6 +91,32 @@ def test_liars_are_named_and_their_voltages_reconstructed() -> None:
         assert np.allclose(verdict.attack[LIARS], expected * truth[k][site().meters[LIARS]], atol=0.012)
         assert not estimate.trusted[LIARS].any()
     assert frames[0].t == START
+
+
+def test_the_threshold_of_a_masked_meter_is_that_of_its_release() -> None:
+    """A power without a reading is an unknown direction of each tick; the lie ends while it is unread."""
+    attacked_, honest = played()[0], played(0.0)[0]
+    unread = site().meters[12]
+    state, deviates = None, []
+    for frame in (*attacked_[: ONSET + 8], *honest[ONSET + 8 :]):
+        p = np.where(np.arange(frame.p.size) == unread, np.nan, frame.p)
+        before = None if state is None else state.core.masked
+        state, _, verdicts = run([replace(frame, p=p)], state)
+        if before is None or not before.meters.any():
+            continue
+        still = before.meters & state.core.masked.meters
+        turns = state.core.masked.turn > before.turn
+        assert ((verdicts[0].score <= verdicts[0].threshold) == turns)[still].all()
+        deviates += (~turns)[still].tolist()
+        now, at = state.core, np.flatnonzero(still)
+        if at.size:
+            m, unknown = np.zeros(still.size), now.history.unknown
+            _, P = masking.deviations(now.filter.full, now.update.exact, m, at, unknown)
+            std = np.sqrt(P.diagonal() + watcher().design.core.modes.noise.diagonal()[at])
+            assert np.allclose(verdicts[0].threshold[at], masking.OUTLIER * std, rtol=1e-9)
+            # Each tick of the filter has an amount of its own along it, a lasting one is narrower.
+            assert (std < 0.99 * verdict.deviations(watcher().design.core, now, m)[1][at]).all()
+    assert 0 < sum(deviates) < len(deviates)
 
 
 def test_the_same_frames_give_the_same_answers_from_a_copied_state() -> None:
