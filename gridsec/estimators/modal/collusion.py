@@ -8,15 +8,16 @@ meters with one amount in place of C is an explanation of its own, at ``max(0, L
 J. It has other meters than C, or also some of C with the reverse sign. Let A be the faults of C that g lacks.
 They are not named where that is less than
 
-    max(2 log(1 / DOUBT), MISFIT (L(J - A) - L(J)))
+    max(2 log(1 / DOUBT), e (L(J - A) - L(J))),   e = min(MISFIT, share of the misfit that J leaves)
 
 Beside the other liars, one that lies by less seems off by the reverse, as honest meters do. It is in both C
 and g. The sets without any of C are taken first, then by their L. Each that keeps further names counts as an
 explanation.
 
-Steps and ramps describe a drift of unknown onset and shape to a share of its evidence only, `MISFIT`. The
-promise limits g: (J - C) + g and the masked meters are at most M or a third, whichever is larger. An
-explanation of more meters names none.
+Steps and ramps describe a drift of unknown onset and shape to a share of its evidence only, `MISFIT`. Where
+they describe it better, J leaves less of the misfit of the readings, chance included. The promise limits g:
+(J - C) + g and the masked meters are at most M or a third, whichever is larger. An explanation of more meters
+names none.
 
 **Decoys.** A meter of C that no g replaces must not protect the others. Where no g keeps a name, the lateral
 with the most of C, but not all, splits it. Both parts are checked by themselves, and split again up to
@@ -67,7 +68,7 @@ from gridsec.estimators.modal.mirrors import Neighbourhoods
 from gridsec.estimators.modal.search import DOUBT, Identification, costs_of, identified, mixed
 
 MISFIT = 0.1
-"""Share of an explanation's evidence that steps and ramps leave open, 1."""
+"""Largest share of an explanation's evidence that steps and ramps leave open, 1."""
 SPLITS = 2
 """Largest number of times that accused meters of one sign are split, 1: at most seven checks."""
 ROUNDS, WORTH = 4, 1.0
@@ -82,7 +83,7 @@ ALIKE_LESS = 3.0
 """Amount by which L with amounts alike may be below the bound of independent ones, 1: 2 log 2, and more."""
 
 
-def weighed(found: Identification, masked: Bools, near: Neighbourhoods) -> Identification:
+def weighed(found: Identification, masked: Bools, near: Neighbourhoods, left: float = inf) -> Identification:
     """Explanations with sets of meters that may replace accused ones.
 
     Parameters
@@ -93,6 +94,8 @@ def weighed(found: Identification, masked: Bools, near: Neighbourhoods) -> Ident
         Masked meters: they count in the promised number.
     near
         Laterals, and the largest number of manipulated meters that is promised.
+    left
+        Share of the misfit that the likeliest explanation leaves.
     """
     p, J = found.named.size, found.chosen[0]
     first = J.size - near.phases.shape[1]
@@ -113,7 +116,8 @@ def weighed(found: Identification, masked: Bools, near: Neighbourhoods) -> Ident
     fresh[:p] &= ~masked
     sets = [fresh & (sign * amount > 0.0) for sign in _SIGNS]
     sets += [np.arange(J.size) == k for k in np.flatnonzero(J[first:]) + first]
-    cases = [(_Case(problem, J, amount, each, masked, most, near.powers), SPLITS) for each in sets]
+    open_ = min(MISFIT, left)
+    cases = [(_Case(problem, J, amount, each, masked, most, near.powers, open_), SPLITS) for each in sets]
     while cases:
         case, splits = cases.pop()
         accused = case.accused
@@ -156,6 +160,8 @@ class _Case:
         Largest number of manipulated meters that is promised.
     powers : (p,)
         Fault of each meter's customer that is its false power.
+    left
+        Share of the evidence that J leaves open.
     """
 
     problem: SearchProblem
@@ -165,6 +171,7 @@ class _Case:
     masked: Bools
     most: int
     powers: Ints
+    left: float = MISFIT
 
     @property
     def rest(self) -> Bools:
@@ -184,7 +191,7 @@ class _Case:
     def contesting(self) -> list[tuple[float, Bools]]:
         """Differences of L from J, and sets (q,) that keep names of C: those without any of C, then by L."""
         own, without = self.own()
-        limit = own + max(_LEAST, MISFIT * (without - own))
+        limit = own + max(_LEAST, self.left * (without - own))
         found = [
             (any_of(self.accused & one[1]), *one)
             for one in chain(self.instead(without, limit), self.customers())
@@ -196,7 +203,7 @@ class _Case:
         lacking = [self.J & ~(self.accused & ~other) for *_, other in found]
         more = [max(0.0, each - own) for _, each, _ in found]
         alone = _evidence(self.problem, np.stack(lacking)) - own
-        near = more < np.maximum(_LEAST, MISFIT * alone)
+        near = more < np.maximum(_LEAST, self.left * alone)
         return [(one, other) for one, (*_, other), some in zip(more, found, near, strict=True) if some]
 
     def own(self) -> tuple[float, float]:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from math import inf, log, sqrt
+from math import inf, log
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -79,8 +79,6 @@ SETTLED = 0.9
 Faults that grow or begin one after another leave the rest to a transition. Beside one nothing is left but
 chance, and the first ticks of late ones.
 """
-BY_CHANCE = 3.0
-"""Misfit that needs no explanation, in standard deviations of n honest innovations, ``sqrt(2 n)``, 1."""
 OFTEN = 0.3
 """Share of the last ticks with a jump of the loads from which on jumps explain everything, and so nothing, 1.
 
@@ -557,8 +555,9 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     best = int(np.argmin(costs))
     if best:
         found = _searched(core, state, rows[best], known)
-    found = collusion.weighed(mirrors.reflected(found, core.near), state.masked.meters, core.near)
     age = int(test.onsets.age[rows[best]])
+    found = mirrors.reflected(found, core.near)
+    found = collusion.weighed(found, state.masked.meters, core.near, _left(state, found, age))
     share = _explained(state, found, age)
     fits = share >= EXPLAINED and not (age >= test.ticks and _aligned(core, found))
     found = found if fits else replace(found, named=np.zeros_like(found.named))
@@ -568,22 +567,36 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
 def _explained(state: CoreState, found: Identification, age: int) -> float:
     """Share of the misfit beyond chance that the best explanation takes away.
 
-    The model is that of the loads, a steady rival, or from `SETTLED` on a transition. Of an onset before the
-    kept readings, a gain in proportion to their number is compared.
+    The model is that of the loads, a steady rival, or from `SETTLED` on a transition.
     """
     best = 0.0 if state.rivals else 1.0
     for at in dict.fromkeys((0, int((found.model == 0).argmax()))) if state.rivals else ():
-        number, chosen = int(found.model[at]), found.chosen[at]
-        problem, model = found.problems[number], state.rivals[number]
-        if model.transition and not any_of(chosen):
+        model = state.rivals[int(found.model[at])]
+        if model.transition and not any_of(found.chosen[at]):
             continue
-        # Twice the logarithm of a ratio of likelihoods.
-        gain = float(problem.y[chosen] @ mean_amounts(problem, chosen)) * min(1.0, model.ticks / age)
-        beyond = model.misfit - BY_CHANCE * sqrt(2.0 * model.count)
-        share = gain / beyond if beyond > 0.0 else 1.0
-        if (number == 0 or model.unsteady < OFTEN) and not (model.transition and share < SETTLED):
+        beyond = model.misfit - model.chance
+        share = _gain(found, at, model, age) / beyond if beyond > 0.0 else 1.0
+        if (not found.model[at] or model.unsteady < OFTEN) and not (model.transition and share < SETTLED):
             best = max(best, share)
     return best
+
+
+def _left(state: CoreState, found: Identification, age: int) -> float:
+    """Largest share of the misfit that the best explanation may leave: that which it leaves, and chance."""
+    if not state.rivals:
+        return inf
+    model = state.rivals[int(found.model[0])]
+    left = model.misfit + model.chance - _gain(found, 0, model, age)
+    return max(left, 0.0) / model.misfit if model.misfit > 0.0 else inf
+
+
+def _gain(found: Identification, at: int, model: Rival, age: int) -> float:
+    """Twice the logarithm of the likelihood's gain by an explanation, at its mean amounts.
+
+    Of an onset before the kept readings, a gain in proportion to their number.
+    """
+    problem, chosen = found.problems[int(found.model[at])], found.chosen[at]
+    return float(problem.y[chosen] @ mean_amounts(problem, chosen)) * min(1.0, model.ticks / age)
 
 
 def _aligned(core: Core, found: Identification) -> bool:

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import log
+from math import log, sqrt
 
 import numpy as np
 from scipy.linalg import lapack
@@ -58,6 +58,8 @@ The variances are those times `WITHIN_S` over the correlation time, between its 
 """
 RECENT = 8.0
 """Memory of the share of ticks with a jump, ticks."""
+BY_CHANCE = 3.0
+"""Misfit that needs no explanation, in standard deviations of n honest innovations, ``sqrt(2 n)``, 1."""
 APART = 0.05
 """Standard deviation of a reading within a transition, squared pu: manipulations of several percent."""
 RATE = 1.0 / 60.0
@@ -111,6 +113,11 @@ class Rival:
     update: Update | None = None
     loads: float = 1.0
     transition: int = 0
+
+    @property
+    def chance(self) -> float:
+        """Misfit that needs no explanation."""
+        return BY_CHANCE * sqrt(2.0 * self.count)
 
     @property
     def unrest(self) -> float:
