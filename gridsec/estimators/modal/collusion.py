@@ -36,11 +36,11 @@ has the relaxation
 which is convex (`alike.bounded_minimum`). With any amounts of the sign, and independent ones of the rest, it
 is a minimum over z >= 0 of all usable meters, ``z' F z / 2 - z' y``, a bound. Where that is above the limit
 of a naming, the meters with the largest z are the only g. Elsewhere the relaxation's solution orders the
-meters. The best beginning of this order is improved by single meters and by exchanges. x is first the mean
-amount of C, then that of the set found. Where that gains nothing and the solution has more meters than the
-promise, x is larger. Where the best g has meters of C, the best one without them is also found. g is also
-looked for in place of the rest's meters of its own sign, since colluding meters may share one amount, and of
-its faults that are no meters.
+meters. The best beginning of this order is improved by single meters and by exchanges, and so are the best of
+the laterals and of such sets of earlier searches. x is first the mean amount of C, then that of the set
+found. Where that gains nothing and the solution has more meters than the promise, x is larger. Where the best
+g has meters of C, the best one without them is also found. g is also looked for in place of the rest's meters
+of its own sign, since colluding meters may share one amount, and of its faults that are no meters.
 """
 
 from __future__ import annotations
@@ -79,12 +79,20 @@ _LEAST = -2.0 * log(DOUBT)
 """Difference of L below which a set contests a name in any case, 1: the limit of a naming."""
 _COUNTS = -2.0 * log(2.0 * DOUBT)
 """Largest cost of a set that contests a name: twice the weight from which on a set counts in the variance."""
+STARTS = 4
+"""Sets of earlier searches and laterals that are improved besides those of the relaxation, 1."""
 ALIKE_LESS = 3.0
 """Amount by which L with amounts alike may be below the bound of independent ones, 1: 2 log 2, and more."""
 
 
-def weighed(found: Identification, masked: Bools, near: Neighbourhoods, left: float = inf) -> Identification:
-    """Explanations with sets of meters that may replace accused ones.
+def weighed(
+    found: Identification,
+    masked: Bools,
+    near: Neighbourhoods,
+    left: float = inf,
+    known: Bools | None = None,
+) -> tuple[Identification, Bools]:
+    """Explanations with sets of meters that may replace accused ones, and these sets, (k, p).
 
     Parameters
     ----------
@@ -96,6 +104,8 @@ def weighed(found: Identification, masked: Bools, near: Neighbourhoods, left: fl
         Laterals, and the largest number of manipulated meters that is promised.
     left
         Share of the misfit that the likeliest explanation leaves.
+    known : (k, p)
+        Such sets of earlier searches; None: none.
     """
     p, J = found.named.size, found.chosen[0]
     first = J.size - near.phases.shape[1]
@@ -103,21 +113,22 @@ def weighed(found: Identification, masked: Bools, near: Neighbourhoods, left: fl
     named[:p] = found.named & ~masked
     named[first:] = found.weight @ ~found.chosen[:, first:] < DOUBT
     if not any_of(named) or (np.count_nonzero(J) == 1 and not any_of(masked)):
-        return found
+        return found, _NONE
     most = max(near.most, p // 3)
     if np.count_nonzero(J[:p] | masked) > most:
-        return replace(found, named=found.named & masked)
+        return replace(found, named=found.named & masked), _NONE
     model = int(found.model[0])
     problem, amount = found.problems[model], np.zeros(J.size)
     amount[J] = mean_amounts(problem, J)
-    by_model, contested = costs_of(found), np.zeros_like(J)
+    by_model, contested, replacing = costs_of(found), np.zeros_like(J), list[Bools]()
     # The onset may be older than that of a masked meter, which J then has, too.
     fresh = J & (np.arange(J.size) < p)
     fresh[:p] &= ~masked
     sets = [fresh & (sign * amount > 0.0) for sign in _SIGNS]
     sets += [np.arange(J.size) == k for k in np.flatnonzero(J[first:]) + first]
-    open_ = min(MISFIT, left)
-    cases = [(_Case(problem, J, amount, each, masked, most, near.powers, open_), SPLITS) for each in sets]
+    begun = near.laterals if known is None or not len(known) else np.vstack([near.laterals, known])
+    every = _Case(problem, J, amount, J, masked, most, near.powers, begun, min(MISFIT, left))
+    cases = [(replace(every, accused=each), SPLITS) for each in sets]
     while cases:
         case, splits = cases.pop()
         accused = case.accused
@@ -127,6 +138,7 @@ def weighed(found: Identification, masked: Bools, near: Neighbourhoods, left: fl
             kept = accused & named & ~other & ~contested
             if any_of(kept):
                 contested |= kept
+                replacing.append(other[:p])
                 # No more than J: few meters are likelier than many. What keeps names counts in the estimate.
                 cost = min(by_model[model][J.tobytes()] + max(more, GAIN), _COUNTS)
                 key = other.tobytes()
@@ -134,12 +146,13 @@ def weighed(found: Identification, masked: Bools, near: Neighbourhoods, left: fl
         if splits and not any_of(accused & contested):
             cases += [(replace(case, accused=part), splits - 1) for part in _split(accused, near.laterals)]
     if not any_of(contested):
-        return found
+        return found, _NONE
     out = identified(found.problems, by_model)
-    return replace(out, named=out.named & ~contested[:p])
+    return replace(out, named=out.named & ~contested[:p]), np.array(replacing)
 
 
 _SIGNS = (1.0, -1.0)
+_NONE: Bools = np.zeros((0, 0), dtype=np.bool_)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,6 +173,8 @@ class _Case:
         Largest number of manipulated meters that is promised.
     powers : (p,)
         Fault of each meter's customer that is its false power.
+    known : (k, p)
+        Sets of meters from which g is looked for, besides those of the relaxation.
     left
         Share of the evidence that J leaves open.
     """
@@ -171,7 +186,8 @@ class _Case:
     masked: Bools
     most: int
     powers: Ints
-    left: float = MISFIT
+    known: Bools
+    left: float
 
     @property
     def rest(self) -> Bools:
@@ -235,7 +251,7 @@ class _Case:
             begun = without if np.array_equal(each, rest) else float(_evidence(problem, each[None])[0])
             s2, own = float(problem.std[0]) ** 2, self.meters[at]
             for sign in signs:
-                relaxed = _Relaxed(sign * y, F, s2, ~masked[at], room)
+                relaxed = _Relaxed(sign * y, F, s2, ~masked[at], room, self.known[:, at])
                 # The best set without any of them may keep more names.
                 for barred in (np.zeros_like(own), own) if sign == -self.sign else (own,):
                     least, inside = relaxed.found(size, barred, limit + ALIKE_LESS - begun)
@@ -381,6 +397,8 @@ class _Relaxed:
         Meters that count in the size of a set.
     room
         Largest number of these.
+    known : (n, k)
+        Sets that are improved besides the relaxation's.
     """
 
     y: Floats
@@ -388,11 +406,13 @@ class _Relaxed:
     s2: float
     counted: Bools
     room: int
+    known: Bools
 
     def found(self, amount: float, barred: Bools, limit: float) -> tuple[float, Bools]:
         """Least fit without the meters barred, (k,), and its set; infinite where the bound excludes all."""
         n, out = np.flatnonzero(~barred), np.zeros_like(barred)
-        part = _Relaxed(self.y[n], submatrix(self.F, n, n), self.s2, self.counted[n], self.room)
+        F, known = submatrix(self.F, n, n), self.known[:, n]
+        part = _Relaxed(self.y[n], F, self.s2, self.counted[n], self.room, known)
         least, inside = part.bound()
         least, inside = part.best(amount) if least < limit else (inf, inside)
         out[n[inside]] = True
@@ -404,9 +424,11 @@ class _Relaxed:
         if not best.size or self.room <= 0:
             return least, best
         start, tried = np.full(best.size, HALF), amount
+        known = self._known()
         for _ in range(ROUNDS):
             share, before, now = self._share(amount, start), least, 0.0
-            end = _Limited(self, self._rounded(share)).descend()
+            end = _Limited(self, np.vstack([self._rounded(share), known])).descend()
+            known = known[:0]
             one = int(end.cost.argmin())
             if end.cost[one] < least:
                 least, best = float(end.cost[one]), end.inside[one]
@@ -419,6 +441,14 @@ class _Relaxed:
             start, amount = np.clip(share * amount / now, 0.0, 1.0), now
             tried = max(tried, now)
         return least, best
+
+    def _known(self) -> Bools:
+        """Known sets with the best fits, (n, k)."""
+        count = np.count_nonzero(self.known & self.counted, axis=1)
+        some = self.known[(count <= self.room) & self.known.any(axis=1)]
+        one = _OneSign(self.y, self.F, self.s2, some[:0])
+        fit = one.fit(some @ self.y, np.vecdot(some @ self.F, some))
+        return np.asarray(some[np.argsort(fit, kind="stable")[:STARTS]])
 
     def _rounded(self, share: Floats) -> Bools:
         """Beginnings of the order by the shares: the best one, the larger half, and the longest, (n, k)."""

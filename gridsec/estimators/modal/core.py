@@ -520,12 +520,15 @@ class Suspicion:
         The best one explains the misfit since then, and better than errors alike within the classes.
     settled
         It explains nearly all of it.
+    replacing : (k, p)
+        Sets of colluding meters that have kept names, the latest ones last.
     """
 
     row: int
     found: Identification
     fits: bool = True
     settled: bool = True
+    replacing: Bools | None = field(default=None, repr=False)
 
 
 def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion | None = None) -> Suspicion:
@@ -557,11 +560,16 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
         found = _searched(core, state, rows[best], known)
     age = int(test.onsets.age[rows[best]])
     found = mirrors.reflected(found, core.near)
-    found = collusion.weighed(found, state.masked.meters, core.near, _left(state, found, age))
+    replacing = None if before is None else before.replacing
+    found, more = collusion.weighed(
+        found, state.masked.meters, core.near, _left(state, found, age), replacing
+    )
+    if len(more):
+        replacing = (more if replacing is None else np.vstack([replacing, more]))[-RECALLED:]
     share = _explained(state, found, age)
     fits = share >= EXPLAINED and not (age >= test.ticks and _aligned(core, found))
     found = found if fits else replace(found, named=np.zeros_like(found.named))
-    return Suspicion(rows[best], found, fits, fits and share >= SETTLED)
+    return Suspicion(rows[best], found, fits, fits and share >= SETTLED, replacing)
 
 
 def _explained(state: CoreState, found: Identification, age: int) -> float:

@@ -43,7 +43,7 @@ def explanation(given: SearchProblem, accused: Bools, *, power: bool = False) ->
 
 def contested(given: Identification, masked: Bools, most: int, *, powers: bool = False) -> Bools:
     """Named meters that other explanations replace, (p,)."""
-    return given.named & ~collusion.weighed(given, masked, near(most, powers=powers)).named
+    return given.named & ~collusion.weighed(given, masked, near(most, powers=powers))[0].named
 
 
 def near(most: int, *, powers: bool = False) -> Neighbourhoods:
@@ -62,6 +62,7 @@ def some(*meters: int) -> Bools:
 NONE = some()
 OWN = METERS + np.arange(METERS)
 NOT_FIRST = ~some(0, 1, 2, 3)
+NO_SETS = np.zeros((0, METERS), dtype=np.bool_)
 
 
 def test_the_evidence_is_the_cost_without_the_penalty_of_meters() -> None:
@@ -82,7 +83,7 @@ def test_the_set_with_one_amount_is_the_best_of_all(seed: int) -> None:
     given, room = street(0.8 * some(0, 1, 2, 3).astype(np.float64), seed), 4
     own, barred = np.append(some(7), False), some(11)
     at, y, F = collusion._beside(given, own, ~(own[:METERS] | barred))
-    found = collusion._Relaxed(y, F, 1.0, np.ones(at.size, dtype=np.bool_), room)
+    found = collusion._Relaxed(y, F, 1.0, np.ones(at.size, dtype=np.bool_), room, NO_SETS[:, : at.size])
     least, inside = found.best(0.5)
     assert set(at.tolist()) == set(range(METERS)) - {7, 11}
 
@@ -111,7 +112,7 @@ def test_a_relaxation_of_too_many_meters_is_solved_for_larger_amounts(amount: fl
     lie = np.isin(np.arange(p), rng.permutation(10)[:7])
     F = np.linalg.inv(V)
     y = F @ (0.8 * lie + np.linalg.cholesky(V) @ rng.standard_normal(p))
-    relaxed = collusion._Relaxed(y, F, 1.0, np.ones(p, dtype=np.bool_), 7)
+    relaxed = collusion._Relaxed(y, F, 1.0, np.ones(p, dtype=np.bool_), 7, np.zeros((0, p), dtype=np.bool_))
     assert relaxed._share(amount, np.full(p, 0.5)).sum() > 7.0
     least, inside = relaxed.best(amount)
     assert (inside == lie).all()
@@ -124,7 +125,7 @@ def test_the_bound_is_that_of_all_amounts_of_the_sign(seed: int, sign: float) ->
     """Against nonnegative least squares, and below the fits of all sets that a search finds."""
     given, own = street(0.8 * some(0, 1, 2, 3).astype(np.float64), seed), np.append(some(7), False)
     at, y, F = collusion._beside(given, own, ~own[:METERS])
-    relaxed = collusion._Relaxed(sign * y, F, 1.0, np.ones(at.size, dtype=np.bool_), 4)
+    relaxed = collusion._Relaxed(sign * y, F, 1.0, np.ones(at.size, dtype=np.bool_), 4, NO_SETS[:, : at.size])
     root = np.linalg.cholesky(F)
     aim = np.linalg.solve(root, sign * y)
     rest = nnls(root.T, aim)[1]
@@ -133,6 +134,30 @@ def test_the_bound_is_that_of_all_amounts_of_the_sign(seed: int, sign: float) ->
     assert bound <= relaxed.best(0.5)[0]
     order = np.argsort(-nnls(root.T, aim)[0], kind="stable")
     assert set(np.flatnonzero(inside)) <= set(order[:4])
+
+
+def test_a_known_set_is_improved_within_the_promise() -> None:
+    """A set near the lie leads there; sets of more meters and of none are left out."""
+    given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
+    at, y, F = collusion._beside(given, np.zeros(METERS + 1, dtype=np.bool_), ~NONE)
+    every = np.ones(at.size, dtype=np.bool_)
+    beginning = np.stack([some(0, 1, 2, 6), some(*range(6)), NONE])
+    known = collusion._Relaxed(y, F, 1.0, every, 4, beginning)
+    assert known._known().tolist() == [some(0, 1, 2, 6).tolist()]
+    least, inside = known.best(0.8)
+    assert inside.tolist() == some(0, 1, 2, 3).tolist()
+    assert np.isclose(least, collusion._Limited(known, inside[None]).cost[0], rtol=1e-12)
+
+
+def test_sets_that_keep_names_are_known_to_the_next_search() -> None:
+    """The sets come back with the explanations; none where no name is kept."""
+    given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
+    _, sets = collusion.weighed(explanation(given, some(4, 5)), NONE, near(4))
+    assert sets.tolist() == [some(0, 1, 2, 3).tolist()]
+    _, again = collusion.weighed(explanation(given, some(4, 5)), NONE, near(4), known=sets)
+    assert again.tolist() == sets.tolist()
+    _, none = collusion.weighed(explanation(given, some(0)), NONE, near(4))
+    assert not len(none)
 
 
 def test_an_honest_meter_amid_colluding_ones_is_contested() -> None:
@@ -203,7 +228,7 @@ def test_the_evidence_against_meters_that_a_set_lacks_is_compared(
 def test_a_set_that_contests_a_part_is_reported() -> None:
     """The meter that both explanations accuse stays named."""
     given = street(0.8 * some(0, 1, 2) + 0.6 * some(3))
-    out = collusion.weighed(explanation(given, some(3, 4, 5)), NONE, near(4))
+    out, _ = collusion.weighed(explanation(given, some(3, 4, 5)), NONE, near(4))
     assert (out.named == some(3)).all()
     assert (out.chosen[1, :METERS] == some(0, 1, 2, 3)).all()
 
@@ -213,7 +238,7 @@ def test_one_set_without_the_meters_accused_is_reported_alone() -> None:
     given, accused = street(0.8 * some(0, 1, 2) + 0.6 * some(3), 3), some(3, 4, 5)
     likelier, other = evidence(given, np.stack([some(0, 1, 2, 3), some(0, 1, 2)]))
     assert likelier < other
-    out = collusion.weighed(explanation(given, accused), NONE, near(4))
+    out, _ = collusion.weighed(explanation(given, accused), NONE, near(4))
     assert not out.named.any()
     assert len(out.chosen) == 2
     assert not (out.chosen[1, :METERS] & accused).any()
@@ -268,7 +293,7 @@ def test_nothing_named_is_not_contested() -> None:
     given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
     shown = explanation(given, some(4, 5))
     nothing = Identification(shown.chosen, shown.model, shown.weight, NONE, shown.problems)
-    assert collusion.weighed(nothing, NONE, near(4)) is nothing
+    assert collusion.weighed(nothing, NONE, near(4))[0] is nothing
 
 
 def test_a_false_power_beside_it_protects_no_manipulated_meter() -> None:
@@ -283,7 +308,7 @@ def test_a_false_power_beside_it_protects_no_manipulated_meter() -> None:
 def test_the_other_set_is_no_likelier_than_the_explanation() -> None:
     """It is reported behind the explanation, also where it fits better."""
     given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
-    out = collusion.weighed(explanation(given, some(4, 5)), NONE, near(4))
+    out, _ = collusion.weighed(explanation(given, some(4, 5)), NONE, near(4))
     assert (out.chosen[0, :METERS] == some(4, 5)).all()
     assert (out.chosen[1, :METERS] == some(0, 1, 2, 3)).all()
     assert out.weight[0] > out.weight[1] > 0.4
@@ -310,7 +335,7 @@ def busbar(lie: Floats) -> SearchProblem:
 def test_colluding_meters_contest_the_meter_of_the_busbar(most: int, named: bool) -> None:
     """Four meters are off by one amount: beside a fifth the busbar is named only if five are not promised."""
     given = busbar(0.8 * ~NOT_FIRST + 2.0 * some(6))
-    out = collusion.weighed(explanation(given, some(6), power=True), NONE, near(most))
+    out, _ = collusion.weighed(explanation(given, some(6), power=True), NONE, near(most))
     assert (out.weight @ ~out.chosen[:, -1] < DOUBT) == named
     assert (out.named == some(6)).all()
     sets = [np.append(some(6), True), np.append(some(0, 1, 2, 3, 6), False)]
@@ -321,8 +346,8 @@ def test_a_sole_fault_of_the_busbar_is_left_to_the_prior() -> None:
     """Without masked meters it is likelier than four meters; beside a masked one it is contested."""
     given = busbar(0.8 * ~NOT_FIRST)
     one = explanation(given, NONE, power=True)
-    assert collusion.weighed(one, NONE, near(5)) is one
-    out = collusion.weighed(one, some(11), near(5))
+    assert collusion.weighed(one, NONE, near(5))[0] is one
+    out, _ = collusion.weighed(one, some(11), near(5))
     assert out.weight @ ~out.chosen[:, -1] >= DOUBT
 
 
@@ -344,7 +369,7 @@ def test_customers_with_false_powers_contest_an_honest_meter() -> None:
         np.append(some(4), some(7))[None], np.zeros(1, np.intp), np.ones(1), some(4), (given,)
     )
     assert (contested(shown, NONE, 4, powers=True) == some(4)).all()
-    out = collusion.weighed(shown, NONE, near(4, powers=True))
+    out, _ = collusion.weighed(shown, NONE, near(4, powers=True))
     assert (out.chosen[1] == np.append(some(1), some(1))).all()
     # The customer's meter is masked already, and its power is free.
     assert (contested(shown, some(1), 4, powers=True) == some(4)).all()
@@ -353,7 +378,9 @@ def test_customers_with_false_powers_contest_an_honest_meter() -> None:
 def instead_of_four(given: SearchProblem, rest: np.ndarray) -> list[tuple[float, np.ndarray]]:
     """Customers in place of meter 4, beside the rest; at most 4 meters are promised."""
     J = rest | np.append(some(4), NONE)
-    case = collusion._Case(given, J, 1.0 * J, np.append(some(4), NONE), NONE, 4, OWN)
+    case = collusion._Case(
+        given, J, 1.0 * J, np.append(some(4), NONE), NONE, 4, OWN, NO_SETS, collusion.MISFIT
+    )
     assert (case.rest == rest).all()
     return list(case.customers())
 
