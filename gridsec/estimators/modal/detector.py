@@ -75,8 +75,9 @@ PINS = 3
 
 _TINY = float(np.finfo(np.float64).tiny)
 _LOG_WEIGHTS = np.log(np.array(WEIGHTS))[:, None]
-# One row more: a row that is given back is free at the next tick only.
+# Pinned rows are kept besides. One row more: a row that is given back is free at the next tick only.
 _STEPS = STEP_ROWS + EVERY + PINS + 1
+_RAMPS = RAMP_ROWS + 1 + PINS + 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,7 +194,7 @@ def start(modes: Modes) -> Detector:
     modes
         The modes.
     """
-    onsets = signatures.empty(modes, _STEPS, RAMP_ROWS + 2)
+    onsets = signatures.empty(modes, _STEPS, _RAMPS)
     return Detector(onsets, np.full((3, onsets.age.size), -inf), 0, None, np.zeros_like(onsets.used), -inf)
 
 
@@ -457,7 +458,7 @@ def _thin(onsets: Onsets, pinned: Bools, capital: Floats, ratio: Floats) -> list
     return gone
 
 
-_NO_EVIDENCE = Evidence(-inf, np.full((len(WEIGHTS), _STEPS + RAMP_ROWS + 2), -inf))
+_NO_EVIDENCE = Evidence(-inf, np.full((len(WEIGHTS), _STEPS + _RAMPS), -inf))
 
 
 def _hand_over(kinds: list[tuple[list[float], list[float]]], row: int, near: list[int]) -> None:

@@ -209,6 +209,25 @@ def test_dropping_onsets_leaves_m_and_covers_all_ages() -> None:
     assert np.isfinite(evidence.log_m)
 
 
+@pytest.mark.parametrize("ramps", [False, True])
+def test_pinned_onsets_stay_in_their_rows(ramps: bool) -> None:
+    """All `PINS` of one kind; new onsets never find all rows in use, and the pinned ones age by each tick."""
+    made = modes(busbar())
+    of = signatures.columns(made, power_columns(FEEDER), np.full(24, 0.05), 0.01)
+    state, more, test = modal.start(made, 0.0), static.start(made), detector.start(made)
+    source, begun, rows = Source(busbar(), np.random.default_rng(9)), np.zeros(0, dtype=np.intp), np.zeros(0)
+    for k in range(900):
+        state, more, update = full.step(made, state, more, float(k), source.tick())
+        test, _ = detector.step(made, of, test, update, more, h=1.0, alert=-inf)
+        kind = test.onsets.used & (test.onsets.ramp == ramps)
+        if k == 600:
+            begun = np.flatnonzero(kind)[: detector.PINS]
+            test, rows = detector.pin(test, begun), test.onsets.age[begun]
+        if k >= 600:
+            assert (test.onsets.age[begun] == rows + k - 600).all()
+            assert not (test.onsets.used | (test.onsets.ramp != ramps)).all()
+
+
 def test_onsets_beyond_the_oldest_age_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(detector, "OLDEST", 100)
     made = modes(busbar())
