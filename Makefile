@@ -19,13 +19,13 @@ demo: $(VENV)/.installed-demo
 
 test: $(VENV)/.installed
 	$(MAKE) --jobs --output-sync check
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "not acceptance"
+	$(BIN)/python -m pytest -n auto -m "not acceptance"
 
 # All tests. Coverage is traced here only: tracing takes a quarter of the time on Python 3.11.
 acceptance: $(VENV)/.installed
 	$(MAKE) --jobs --output-sync check
 	$(BIN)/python -m coverage erase
-	$(BIN)/python -m pytest -n auto --dist worksteal --cov --cov-report=
+	$(BIN)/python -m pytest -n auto --cov --cov-report=
 	$(BIN)/python -m coverage report --fail-under=95
 
 check: lint types imports

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import gc
-import math
 import os
 import sys
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from fnmatch import fnmatch
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import hypothesis
 import pytest
@@ -29,11 +27,6 @@ hypothesis.settings.register_profile(
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )
 hypothesis.settings.load_profile("repeatable")
-
-FAST_EXAMPLES = 1 / 3
-"""Share of the examples of a property test in the fast tier: the first ones; the acceptance tier has all."""
-LEAST_EXAMPLES = 5
-"""Examples of a property test in the fast tier, at least."""
 
 SYSTEM_PARTS = {"alertmanager", "browser", "postgresql"}
 
@@ -61,18 +54,6 @@ def pytest_xdist_auto_num_workers() -> int:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Assign the tiers before -m selects one of them."""
     config.stash[COLLECTED] = assign(items)
-    if config.option.markexpr == "not acceptance":
-        for test in {getattr(item.obj, "__func__", item.obj) for item in items if hasattr(item, "obj")}:
-            _shorten(test)
-
-
-def _shorten(test: Any) -> None:
-    """Leave a property test the examples of the fast tier. Hypothesis has no setting for a share."""
-    if not hypothesis.is_hypothesis_test(test):
-        return
-    own = test._hypothesis_internal_use_settings
-    count = min(own.max_examples, max(LEAST_EXAMPLES, math.ceil(FAST_EXAMPLES * own.max_examples)))
-    test._hypothesis_internal_use_settings = hypothesis.settings(own, max_examples=count)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -132,22 +113,3 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
         report.outcome = "failed"
         report.longrepr = f"{item.nodeid}: skipped, but {', '.join(sorted(wanted))} must be present here"
     return report
-
-
-@pytest.fixture(scope="session", autouse=True)
-def empty_frames() -> Iterator[None]:
-    """Let pandapower make the empty tables of a network, 0.1 s, only once; a copy for each network."""
-    auxiliary = sys.modules.get("pandapower.auxiliary")
-    if auxiliary is None:
-        yield
-        return
-    made = auxiliary.pandapowerNet.create_dataframes
-    frames = cache(lambda columns: made({"table": dict(columns)})["table"])
-
-    def copied(_: type, data: dict[str, Any]) -> dict[str, Any]:
-        tables = {name: columns for name, columns in data.items() if isinstance(columns, dict)}
-        return data | {name: frames(tuple(columns.items())).copy() for name, columns in tables.items()}
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(auxiliary.pandapowerNet, "create_dataframes", classmethod(copied))
-        yield

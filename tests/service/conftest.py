@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import copy
 import math
 import os
 import secrets
@@ -21,7 +20,7 @@ from typing import Any
 import pytest
 import uvicorn
 from anyio import CapacityLimiter
-from fastapi import FastAPI, applications
+from fastapi import FastAPI
 from playwright.sync_api import Browser, expect, sync_playwright
 from pydantic import TypeAdapter
 
@@ -437,24 +436,6 @@ class Server:
         assert not self.thread.is_alive()
         self.service.loop = None
         _FREE.append(self.api)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def described() -> Iterator[None]:
-    """Let FastAPI describe the same routes, 0.2 s, only once; a copy for each application."""
-    describe = applications.get_openapi
-    made: dict[tuple[Any, ...], tuple[Sequence[Any], dict[str, Any]]] = {}  # The routes keep their ids.
-
-    def copied(*, title: str, routes: Sequence[Any], **given: Any) -> dict[str, Any]:
-        own = (id(each.original_router) if hasattr(each, "original_router") else each.path for each in routes)
-        key = (title, *own)
-        if key not in made:
-            made[key] = routes, describe(title=title, routes=routes, **given)
-        return copy.deepcopy(made[key][1])
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(applications, "get_openapi", copied)
-        yield
 
 
 @pytest.fixture(scope="session")
