@@ -1,7 +1,7 @@
 // Alarm list: loaded once, then updated by the event stream; actions on a single alarm, and its log.
 
 import { ask, post } from "./actions.js";
-import { byId, clock, duration, el, getJson, isKnown, settle, guideLink, signed, sinceNode, volt } from "./dom.js";
+import { byId, clock, duration, el, getJson, isKnown, settle, guideLink, signed, sinceNode, steady, volt } from "./dom.js";
 import { meterName, subjectOf } from "./names.js";
 
 const API = "/api/v1/alarms";
@@ -62,6 +62,7 @@ export class Alarms {
     this.source = null;
     this.retry = null;
     this.problem = null; // Problem of the database: active alarms may be missing in the list.
+    this.render = steady(byId("alarm-list"), () => this.draw());
     setInterval(() => this.check(), EVERY_MS);
     for (const id of ["alarm-state", "alarm-severity", "alarm-kind"]) byId(id).addEventListener("change", () => this.reload());
     byId("alarm-scope").addEventListener("change", () => this.reload());
@@ -202,7 +203,7 @@ export class Alarms {
     return [...this.alarms.values()].filter((a) => this.fits(a)).sort((a, b) => (a.id < b.id ? 1 : -1));
   }
 
-  render() {
+  draw() {
     const list = this.shown();
     byId("alarm-count").hidden = this.raised === 0;
     byId("alarm-count").textContent = `${this.raised} new`;

@@ -118,3 +118,30 @@ export function settle(parent, nodes) {
     if (parent.children[k] !== node) parent.insertBefore(node, parent.children[k] ?? null);
   });
 }
+
+const HELD_MS = 1000; // Longest delay of a drawing by a pressed button.
+
+// Drawing of a list that waits for the release of a pressed button: a press and its release on two nodes are no click.
+export function steady(list, draw) {
+  let held = null; // Timer of a press.
+  let due = false;
+  const end = () => {
+    clearTimeout(held);
+    held = null;
+  };
+  const release = () => {
+    end();
+    if (due) drawn();
+  };
+  const drawn = () => {
+    due = held !== null;
+    if (!due) draw();
+  };
+  list.addEventListener("pointerdown", () => {
+    end();
+    held = setTimeout(release, HELD_MS);
+  });
+  addEventListener("click", end, true); // The click itself draws at once. It follows the release in the same task.
+  for (const name of ["pointerup", "pointercancel"]) addEventListener(name, () => { if (held !== null) setTimeout(release); });
+  return drawn;
+}

@@ -1,7 +1,7 @@
 // Incident list: one line per incident, expandable to its alarms and its log; actions of operators; hand-over.
 
 import { ask, post } from "./actions.js";
-import { byId, clock, duration, el, getJson, guideLink, isKnown, settle, sinceNode } from "./dom.js";
+import { byId, clock, duration, el, getJson, guideLink, isKnown, settle, sinceNode, steady } from "./dom.js";
 import { BUSBAR, customerName, meterName } from "./names.js";
 import { session } from "./session.js";
 
@@ -82,6 +82,7 @@ export class Incidents {
     byId("shift-close").addEventListener("click", () => byId("shift").close());
     byId("shift-since").addEventListener("change", () => this.shift());
     byId("work-open").addEventListener("click", () => this.ask("work"));
+    this.render = steady(byId("incident-list"), () => this.draw());
     alarms.onLog = alarms.onList = () => this.render();
     setInterval(() => this.reload(), EVERY_MS);
   }
@@ -194,7 +195,7 @@ export class Incidents {
     this.render();
   }
 
-  render() {
+  draw() {
     for (const id of this.chosen) if (!this.found.some((one) => one.id === id && answerable(one))) this.chosen.delete(id);
     byId("incident-chosen").hidden = this.chosen.size === 0;
     const text = `${this.chosen.size} selected`;

@@ -51,7 +51,7 @@ def scenario_of(site: Site, seed: int) -> Scenario:
     return Scenario(seed=seed, duration_s=DURATION_S, profile_s=quiet.profile_s, dt_s=1.0, attacks=attacks)
 
 
-@pytest.mark.canary("modal-5", "sequential-5")
+@pytest.mark.canary("modal-5")
 @pytest.mark.parametrize(("estimator", "seed"), RUNS)
 def test_exactly_the_manipulated_meters_are_named(estimator: str, seed: int, tmp_path: Path) -> None:
     site = load(FEEDER)

@@ -289,6 +289,7 @@ def _is_newest(live: Live, reason: str) -> bool:
     return reason in {one["reason"].partition(":")[0] for one in newest}
 
 
+@pytest.mark.acceptance
 def test_every_kind_of_bad_reading_is_named_and_none_stops_the_judging(tmp_path: Path) -> None:
     samples = sampled(load(FEEDER), 10 + len(BAD))
     with serve(FEEDER, tmp_path) as live, Fleet(live) as fleet:

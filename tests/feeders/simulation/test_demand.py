@@ -33,6 +33,7 @@ def test_fluctuation_is_an_ornstein_uhlenbeck_process() -> None:
     assert np.max(np.abs(others - np.eye(20))) < 5.0 / np.sqrt((t[-1] - t[0]) / (2 * correlation))
 
 
+@pytest.mark.acceptance
 def test_variance_is_even_across_the_ends_of_chunks() -> None:
     correlation, copies = 20.0, 20_000
     path = Fluctuation(2, Stream.LOAD, copies, correlation)

@@ -282,6 +282,7 @@ def test_no_more_clean_snapshots_name_somebody_than_allowed(noise: Floats) -> No
         assert clean_and_named(rate, noise, 4000) <= 4000 * rate + 3.0 * np.sqrt(4000 * rate)
 
 
+@pytest.mark.acceptance
 def test_as_many_clean_snapshots_name_somebody_as_allowed_where_the_rate_decides() -> None:
     # At 0.05 the freedom and the prior alone allow less; at 0.001 `anybody` is what they lack.
     assert clean_and_named(0.05, SAME, 4000) < 0.01 * 4000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import re
@@ -26,11 +27,13 @@ from feeders.format.tables import write
 from feeders.model.site import load
 from feeders.simulation.recording import read_recording
 from feeders.simulation.scenario import Scenario, random_attacks
+from gridsec.errors import GridsecError
 from service.cli.demo import DemoResult, verdict
-from service.cli.main import BLAS_THREADS
+from service.cli.main import BLAS_THREADS, EXIT_CODES, exit_code
 from service.cli.simulate import Pace, play
 from service.ingest.queues import BusConfig
 from service.ingest.zenoh_bus import MeterClient
+from service.store.schema import LeaseLost
 from tests.service.commands import command, plain
 from tests.service.running import FEEDER, free_port, until
 
@@ -188,6 +191,14 @@ def test_unknown_feeders_are_all_named() -> None:
     assert "2 problems" in message
     assert "atlantis" in message
     assert "utopia" in message
+
+
+def test_exit_codes_are_those_of_existing_errors() -> None:
+    for name in EXIT_CODES:
+        module, _, kind = name.rpartition(".")
+        assert issubclass(getattr(importlib.import_module(module), kind), GridsecError)
+    assert exit_code(LeaseLost("w1", ["village"])) == EXIT_CODES["service.store.schema.LeaseLost"]
+    assert exit_code(GridsecError("")) == 1
 
 
 def test_wrong_settings_are_all_named(gridsec: Run, monkeypatch: pytest.MonkeyPatch) -> None:

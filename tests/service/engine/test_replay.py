@@ -73,6 +73,7 @@ def test_the_live_rounds_and_a_replay_agree_to_the_last_bit(
     assert sum(tally.ticks.values()) == len(replayed)
 
 
+@pytest.mark.canary("strict")
 @pytest.mark.parametrize("asked", [{}, {"grace_s": 0.1, "max_skew_s": 1.2}], ids=["default", "strict"])
 def test_what_was_live_by_the_wall_clock_is_replayed_by_the_time_of_arrival(
     site: Site, scenario: Scenario, tmp_path: Path, asked: dict[str, float]

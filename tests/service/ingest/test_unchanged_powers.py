@@ -24,6 +24,7 @@ def site() -> Site:
     return without_inverters(INTERVAL_S)
 
 
+@pytest.mark.canary("renewed-agreement", "unchanged-missing-powers")
 @pytest.mark.parametrize(
     ("how", "cause"),
     [

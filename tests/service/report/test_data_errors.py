@@ -58,7 +58,7 @@ def tables(*, exchanged: bool) -> FeederTables:
     return replace(made, meta=replace(made.meta, monitor=monitor), customers=rows)
 
 
-SCENE = Scenario(seed=2, duration_s=1800.0, dt_s=TICK_S)
+SCENE = Scenario(seed=2, duration_s=900.0, dt_s=TICK_S)
 
 
 @pytest.fixture(scope="module")
@@ -67,11 +67,16 @@ def files() -> Site:
 
 
 @pytest.fixture(scope="module")
-def results(files: Site, tmp_path_factory: pytest.TempPathFactory) -> list[TickResult]:
-    """Results of the service for half an hour of the true feeder with these files."""
+def day(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recording of a quarter of an hour of the true feeder."""
     path = tmp_path_factory.mktemp("day") / "day.parquet"
-    recording = record(from_tables(tables(exchanged=False)), SCENE, path)
-    return list(replay(files, read_recording(recording.path).readings(), ReplayCounts()))
+    return record(from_tables(tables(exchanged=False)), SCENE, path).path
+
+
+@pytest.fixture(scope="module")
+def results(files: Site, day: Path) -> list[TickResult]:
+    """Results of the service for the recording with these files."""
+    return list(replay(files, read_recording(day).readings(), ReplayCounts()))
 
 
 def test_the_hint_is_in_the_report_its_reason_and_the_evidence(results: list[TickResult]) -> None:
@@ -167,7 +172,7 @@ def test_the_window_begins_anew_with_a_new_design(files: Site) -> None:
     state, hints = watcher.init(SCENE.start), []
     true = from_tables(tables(exchanged=False))
     assert true.meter_ids == files.meter_ids
-    for one in snapshots(simulate(true, replace(SCENE, duration_s=900.0))):
+    for one in snapshots(simulate(true, SCENE)):
         frame = to_frame(files, one)
         state, estimate, verdict = watcher.step(state, frame)
         hints.append(found.follow(frame, estimate, verdict))
@@ -201,14 +206,13 @@ def test_an_absurd_register_beside_a_false_voltage_breaks_nothing() -> None:
 
 
 def test_a_defect_of_the_comparison_costs_no_verdict(
-    files: Site, results: list[TickResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    files: Site, results: list[TickResult], day: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: object) -> None:
         raise FloatingPointError("a defect")
 
     monkeypatch.setattr(data_errors, "follow", broken)
-    recording = record(from_tables(tables(exchanged=False)), SCENE, tmp_path / "day.parquet")
-    without = list(replay(files, read_recording(recording.path).readings(), ReplayCounts()))
+    without = list(replay(files, read_recording(day).readings(), ReplayCounts()))
     assert [one.report.verdict for one in without] == [one.report.verdict for one in results]
     assert any(one.report.data_error is not None for one in results)
     assert not any(one.report.data_error is not None for one in without)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from dataclasses import replace
 
 import pytest
@@ -30,6 +31,8 @@ pytestmark = pytest.mark.browser
 
 ALARMS = re.compile(r"/api/v1/alarms")
 LIST = re.compile(r"/api/v1/alarms\?")
+PAUSE_S = 60.0
+"""Time from the present at which a page's clock stands, s: above the delay of a call."""
 
 
 def test_a_manipulated_inverter_and_its_alarm(site: Site) -> None:
@@ -178,6 +181,44 @@ def test_a_single_alarm_is_commented_and_its_acknowledgement_withdrawn(site: Sit
     expect(one.locator("button.withdraw")).to_be_visible()
     inside.locator('[data-do="log"]').click()
     expect(page.locator(".alarm .log")).to_have_count(0)
+
+
+def test_a_pressed_button_stays_until_its_release_for_at_most_a_second(site: Site) -> None:
+    """Another operator acknowledges between press and release; the page's clock stands."""
+    site.service.wall = lambda: T0 + 10
+    site.tick(T0, 4, lies={"H3": 9.0, "H5": 9.0})
+    page = site.open()
+    page.clock.install()
+    page.reload()
+    page.evaluate("document.querySelector('#alarm-box').open = true")
+    expect(page.locator("#alarm-list button.ack")).to_have_count(2)
+    expect(page.locator(".incident")).to_have_count(1)
+    page.clock.pause_at(time.time() + PAUSE_S)
+    for meter, held_ms in (("H3", 999), ("H5", 1000)):
+        one = page.locator(f'#alarm-list .alarm:has-text("{meter}")')
+        one.locator('[data-do="log"]').click()
+        page.clock.run_for(1)
+        expect(one.locator(".log li")).to_have_count(1)
+        one.locator('[data-do="comment"]').hover()
+        page.mouse.down()
+        expect(one.locator('[data-do="comment"]:active')).to_have_count(1)
+        page.clock.run_for(held_ms - 1)
+        (alarm,) = (each for each in site.service.store.alarms()[0] if each.meter == meter)
+        with page.expect_response(re.compile(rf"/api/v1/alarms/{alarm.id}/events")):  # the page has the event
+            answer = page.request.post(
+                f"{site.server.url}/api/v1/alarms/{alarm.id}/ack", data={"who": "Bob", "count": 1}
+            )
+        assert answer.ok
+        expect(one.locator("button.ack")).to_be_visible()
+        page.clock.run_for(1)
+        if held_ms < 1000:
+            page.mouse.up()
+            expect(page.locator("#act")).to_be_visible()
+            page.clock.run_for(1)
+            page.click("#act-cancel")
+        expect(one).to_contain_text("Acknowledged by Bob")
+    page.mouse.up()
+    expect(page.locator("#act")).to_be_hidden()
 
 
 def test_what_is_learned_of_the_meters_and_a_replaced_one(site: Site) -> None:

@@ -133,6 +133,7 @@ def full_plays_show_every_row(found: Campaign) -> set[str]:
     return seen
 
 
+@pytest.mark.acceptance
 def test_every_row_is_what_the_full_play_of_its_case_shows(here: Campaign) -> None:
     assert full_plays_show_every_row(here) == {CLEAN, *(kind.name for kind in PLAN.kinds)}
 
@@ -508,6 +509,7 @@ campaign(SITE, PLAN, journal=Path({journal!r}))
 """
 
 
+@pytest.mark.acceptance
 def test_a_killed_campaign_goes_on(here: Campaign, tmp_path: Path) -> None:
     journal = tmp_path / "journal"
     program = PROGRAM.format(here=str(Path(__file__).parent), journal=str(journal))

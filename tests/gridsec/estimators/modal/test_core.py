@@ -157,6 +157,7 @@ def test_jumps_at_every_tick_are_no_evidence() -> None:
     assert (jumped >= core.estimate(kernel, replace(state, loads=1.0)).variance).all()
 
 
+@pytest.mark.canary("growing", "alternating")
 @pytest.mark.parametrize(
     ("pattern", "fits"),
     [

@@ -92,6 +92,7 @@ def test_readings_that_alternate_leave_the_injections_known(lies: tuple[int, ...
     assert np.allclose(shown, ((1.0 - np.exp(-1.0 / droop.tau)) * aim)[at])
 
 
+@pytest.mark.canary("one", "a quarter")
 @pytest.mark.parametrize("lies", [(4,), (4, 7, 9), (3, 4, 7, 9)], ids=["one", "a quarter", "a third"])
 def test_readings_that_alternate_are_never_clean(lies: tuple[int, ...]) -> None:
     """No honest meter is named, and no tick from the first false reading on is CLEAN; some are named."""

@@ -24,7 +24,6 @@ RUNS = [
 
 @pytest.mark.canary(
     "majority-14",
-    "phases-lateral-93",
     "contiguous-low-0",
     "false-power-1",
 )
