@@ -8,7 +8,7 @@ meters with one amount in place of C is an explanation of its own, at ``max(0, L
 J. It has other meters than C, or also some of C with the reverse sign. Let A be the faults of C that g lacks.
 They are not named where that is less than
 
-    max(2 log(1 / DOUBT), e (L(J - A) - L(J))),   e = min(MISFIT, share of the misfit that J leaves)
+    max(2 log(1 / DOUBT), e (L(J - A) - L(J))),   e = min(MISFIT, 2 share of the misfit that J leaves)
 
 Beside the other liars, one that lies by less seems off by the reverse, as honest meters do. It is in both C
 and g. The sets without any of C are taken first, then by their L. Each that keeps further names counts as an
@@ -45,7 +45,7 @@ of its own sign, since colluding meters may share one amount, and of its faults 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from math import inf, log
@@ -79,10 +79,31 @@ _LEAST = -2.0 * log(DOUBT)
 """Difference of L below which a set contests a name in any case, 1: the limit of a naming."""
 _COUNTS = -2.0 * log(2.0 * DOUBT)
 """Largest cost of a set that contests a name: twice the weight from which on a set counts in the variance."""
+OPEN = 2.0
+"""Share that a true set leaves open, in that of the set that suits the readings best, 1."""
 STARTS = 4
 """Sets of earlier searches and laterals that are improved besides those of the relaxation, 1."""
 ALIKE_LESS = 3.0
 """Amount by which L with amounts alike may be below the bound of independent ones, 1: 2 log 2, and more."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Weighed:
+    """Explanations after the check. p meters, q faults.
+
+    Attributes
+    ----------
+    found
+        The explanations, with the sets that keep names.
+    contested : (q,)
+        Meters and phases of the busbar that keep no name.
+    replacing : (p,) each
+        Meters of the sets that keep names.
+    """
+
+    found: Identification
+    contested: Bools
+    replacing: tuple[Bools, ...] = ()
 
 
 def weighed(
@@ -90,9 +111,9 @@ def weighed(
     masked: Bools,
     near: Neighbourhoods,
     left: float = inf,
-    known: Bools | None = None,
-) -> tuple[Identification, Bools]:
-    """Explanations with sets of meters that may replace accused ones, and these sets, (k, p).
+    known: Sequence[Bools] = (),
+) -> Weighed:
+    """Explanations with sets of meters that may replace accused ones.
 
     Parameters
     ----------
@@ -104,8 +125,8 @@ def weighed(
         Laterals, and the largest number of manipulated meters that is promised.
     left
         Share of the misfit that the likeliest explanation leaves.
-    known : (k, p)
-        Such sets of earlier searches; None: none.
+    known : (p,) each
+        Such sets of earlier searches.
     """
     p, J = found.named.size, found.chosen[0]
     first = J.size - near.phases.shape[1]
@@ -113,10 +134,10 @@ def weighed(
     named[:p] = found.named & ~masked
     named[first:] = found.weight @ ~found.chosen[:, first:] < DOUBT
     if not any_of(named) or (np.count_nonzero(J) == 1 and not any_of(masked)):
-        return found, _NONE
+        return Weighed(found, np.zeros_like(J))
     most = max(near.most, p // 3)
     if np.count_nonzero(J[:p] | masked) > most:
-        return replace(found, named=found.named & masked), _NONE
+        return Weighed(replace(found, named=found.named & masked), named)
     model = int(found.model[0])
     problem, amount = found.problems[model], np.zeros(J.size)
     amount[J] = mean_amounts(problem, J)
@@ -126,8 +147,8 @@ def weighed(
     fresh[:p] &= ~masked
     sets = [fresh & (sign * amount > 0.0) for sign in _SIGNS]
     sets += [np.arange(J.size) == k for k in np.flatnonzero(J[first:]) + first]
-    begun = near.laterals if known is None or not len(known) else np.vstack([near.laterals, known])
-    every = _Case(problem, J, amount, J, masked, most, near.powers, begun, min(MISFIT, left))
+    begun = np.vstack([near.laterals, *known])
+    every = _Case(problem, J, amount, J, masked, most, near.powers, begun, min(MISFIT, OPEN * left))
     cases = [(replace(every, accused=each), SPLITS) for each in sets]
     while cases:
         case, splits = cases.pop()
@@ -146,13 +167,12 @@ def weighed(
         if splits and not any_of(accused & contested):
             cases += [(replace(case, accused=part), splits - 1) for part in _split(accused, near.laterals)]
     if not any_of(contested):
-        return found, _NONE
+        return Weighed(found, contested)
     out = identified(found.problems, by_model)
-    return replace(out, named=out.named & ~contested[:p]), np.array(replacing)
+    return Weighed(replace(out, named=out.named & ~contested[:p]), contested, tuple(replacing))
 
 
 _SIGNS = (1.0, -1.0)
-_NONE: Bools = np.zeros((0, 0), dtype=np.bool_)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -276,7 +296,7 @@ class _Case:
         """L of customers with false readings and powers in place of C, and the sets, (q,)."""
         problem, rest, masked, powers = self.problem, self.rest, self.masked, self.powers
         p = problem.meters
-        if not any_of(rest[p:]):
+        if not any_of(self.J[p:]):
             return
         charge = problem.charge.copy()
         charge[powers] = 0.0
@@ -445,7 +465,7 @@ class _Relaxed:
     def _known(self) -> Bools:
         """Known sets with the best fits, (n, k)."""
         count = np.count_nonzero(self.known & self.counted, axis=1)
-        some = self.known[(count <= self.room) & self.known.any(axis=1)]
+        some = np.unique(self.known[(count <= self.room) & self.known.any(axis=1)], axis=0)
         one = _OneSign(self.y, self.F, self.s2, some[:0])
         fit = one.fit(some @ self.y, np.vecdot(some @ self.F, some))
         return np.asarray(some[np.argsort(fit, kind="stable")[:STARTS]])

@@ -4,7 +4,8 @@
     init(core, t) -> CoreState
     step(core, state, t, m, seen) -> (CoreState, Evidence)      every tick, releases masked meters
     identify(core, state, evidence) -> Suspicion                where `alarmed`
-    transition(core, state, suspicion) -> CoreState             where no explanation fits
+    transition(core, state, suspicion) -> CoreState             where the misfit is not settled
+    outlasts(core, state, suspicion) -> bool                    where one reading is all there is
     mask(core, state, suspicion) -> (CoreState, Evidence)       where meters are named
     adopt(core, state, suspicion) -> CoreState                  where loads alone explain the readings
     estimate(core, state, suspicion) -> Estimated               where asked for
@@ -74,11 +75,7 @@ EXPLAINED = 0.25
 A lasting fault explains all of it, one that grows since the onset three quarters, and alternating ones none.
 """
 SETTLED = 0.9
-"""Share from which on no transition is looked for, and below which none counts, 1.
-
-Faults that grow or begin one after another leave the rest to a transition. Beside one nothing is left but
-chance, and the first ticks of late ones.
-"""
+"""Share from which on no transition is looked for, and below which sets beside one name nothing, 1."""
 OFTEN = 0.3
 """Share of the last ticks with a jump of the loads from which on jumps explain everything, and so nothing, 1.
 
@@ -516,19 +513,22 @@ class Suspicion:
         Row of the onset.
     found
         The explanations.
+    contested : (b,)
+        Phases of the busbar with a meter that colluding meters may replace.
     fits
         The best one explains the misfit since then, and better than errors alike within the classes.
     settled
         It explains nearly all of it.
-    replacing : (k, p)
-        Sets of colluding meters that have kept names, the latest ones last.
+    replacing : (p,) each
+        Sets of colluding meters that have kept names, the latest ones first.
     """
 
     row: int
     found: Identification
+    contested: Bools
     fits: bool = True
     settled: bool = True
-    replacing: Bools | None = field(default=None, repr=False)
+    replacing: tuple[Bools, ...] = field(default=(), repr=False)
 
 
 def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion | None = None) -> Suspicion:
@@ -560,16 +560,15 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
         found = _searched(core, state, rows[best], known)
     age = int(test.onsets.age[rows[best]])
     found = mirrors.reflected(found, core.near)
-    replacing = None if before is None else before.replacing
-    found, more = collusion.weighed(
-        found, state.masked.meters, core.near, _left(state, found, age), replacing
-    )
-    if len(more):
-        replacing = (more if replacing is None else np.vstack([replacing, more]))[-RECALLED:]
+    replacing = () if before is None else before.replacing
+    weighed = collusion.weighed(found, state.masked.meters, core.near, _left(state, found, age), replacing)
+    sets = {each.tobytes(): each for each in (*weighed.replacing, *replacing)}
+    found, replacing = weighed.found, tuple(sets.values())[:RECALLED]
     share = _explained(state, found, age)
     fits = share >= EXPLAINED and not (age >= test.ticks and _aligned(core, found))
     found = found if fits else replace(found, named=np.zeros_like(found.named))
-    return Suspicion(rows[best], found, fits, fits and share >= SETTLED, replacing)
+    contested = weighed.contested[core.modes.size + core.faults.powers :]
+    return Suspicion(rows[best], found, contested, fits, fits and share >= SETTLED, replacing)
 
 
 def _explained(state: CoreState, found: Identification, age: int) -> float:
@@ -584,7 +583,10 @@ def _explained(state: CoreState, found: Identification, age: int) -> float:
             continue
         beyond = model.misfit - model.chance
         share = _gain(found, at, model, age) / beyond if beyond > 0.0 else 1.0
-        if (not found.model[at] or model.unsteady < OFTEN) and not (model.transition and share < SETTLED):
+        if model.transition and share < SETTLED:
+            # The names are those of its sets.
+            return 0.0
+        if not found.model[at] or model.unsteady < OFTEN:
             best = max(best, share)
     return best
 
@@ -647,6 +649,30 @@ def transition(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
     if not any(best is each for each in found):
         return state
     return replace(state, rivals=(*(each for each in state.rivals if not each.transition), best))
+
+
+def outlasts(core: Core, state: CoreState, suspicion: Suspicion) -> bool:
+    """A search names the same meters after one more tick as the filter expected this one: an honest one.
+
+    Parameters
+    ----------
+    core, state
+        The core, and the state after the tick of the onset.
+    suspicion
+        The explanations after the same tick.
+    """
+    update, made = state.update, core.modes
+    assert update is not None  # noqa: S101  # a search follows a tick
+    _, m, seen, unknown, _ = state.history.readings[-1]
+    nu = update.innovation @ made.back.T
+    if update.exact is not None:
+        nu = np.zeros(made.size)
+        nu[update.exact.rows] = update.exact.half @ update.exact.white
+    after, evidence = step(core, state, state.filter.t + update.gap.h, m - nu, seen, unknown)
+    if not alarmed(core, evidence) or not any_of(after.detector.pinned):
+        return False
+    again = identify(core, after, evidence, suspicion)
+    return bool((again.found.named >= suspicion.found.named).all())
 
 
 def _keeping(found: Identification) -> Bools:

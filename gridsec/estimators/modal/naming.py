@@ -3,14 +3,8 @@
     final(found, named, streak, since, laterals) -> (p,)      meters to mask
 
 A search names the meters without which nothing explains the readings. One reading may be an outlier, and the
-first explanation of several faults a part of them: names need searches in turn, `confirmed`.
-
-**One reading.** A sole fault needs two readings, unless the next one cannot take its name back. An honest one
-would double the information F, where white errors dominate, and add no score: the likelihood's gain ``y^2 /
-F`` is halved. With the penalty c of the meter, sets without it weigh ``w <= exp(-(gain - c) / 2)`` together.
-With half of the gain they weigh less than `DOUBT` for
-
-    w <= DOUBT^2 exp(-c / 2)
+first explanation of several faults a part of them: names need searches in turn, `confirmed`. A sole fault is
+named by its first reading if a search still names it after an honest one in turn (`core.outlasts`).
 
 **Parts of an explanation.** Masked meters have any amounts. With N the meters to mask, of the scores y and
 the information F of the others remain
@@ -28,18 +22,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import exp
 
 import numpy as np
 
 from gridsec.arrays import Bools, Ints, all_of, any_of
-from gridsec.estimators.modal.costs import SearchProblem, informed, penalties
+from gridsec.estimators.modal.costs import SearchProblem, informed
 from gridsec.estimators.modal.laterals import excess
 from gridsec.estimators.modal.replay import Reading
-from gridsec.estimators.modal.search import DOUBT, SOME, Identification, mixed
+from gridsec.estimators.modal.search import SOME, Identification, mixed
 
 CONFIRM = 2
-"""Searches in turn that accuse a fault before it is named, and readings of a meter that one search names.
+"""Searches in turn that accuse a fault before it is named. Least readings of a meter that one search names.
 
 One reading may be an outlier, and the first explanation of several faults a part of them.
 """
@@ -90,8 +83,7 @@ def confirmed(found: Identification, named: Bools, streak: Ints, since: Sequence
     sole = np.flatnonzero(named)
     if sole.size == 1 and np.count_nonzero(found.chosen[0]) == 1:
         readings = sum(seen is None or bool(seen[sole[0]]) for _, _, seen, *_ in since)
-        others = float(found.weight @ ~found.chosen[:, sole[0]])
-        if readings >= CONFIRM or (readings and others <= DOUBT**2 * exp(-0.5 * penalties(named.size)[1])):
+        if readings >= CONFIRM:
             return named
     # Without a part of the meters, other faults may explain the rest: a few more searches may name all.
     least = CONFIRM if all_of(streak[named] >= CONFIRM) else APART

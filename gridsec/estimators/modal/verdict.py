@@ -354,7 +354,7 @@ def accused(core: Core, suspicion: Suspicion) -> Bools:
 
 
 def certain_phases(core: Core, suspicion: Suspicion) -> Bools:
-    """Phases of the busbar without which nothing explains the readings, (b,); b counts those with a meter.
+    """Phases of the busbar that nothing replaces in explanations, (b,); b counts those with a meter.
 
     Parameters
     ----------
@@ -362,7 +362,7 @@ def certain_phases(core: Core, suspicion: Suspicion) -> Bools:
         The core, and the explanations.
     """
     found, first = suspicion.found, core.modes.size + core.faults.powers
-    return np.asarray(found.weight @ ~found.chosen[:, first:] < DOUBT)
+    return np.asarray((found.weight @ ~found.chosen[:, first:] < DOUBT) & ~suspicion.contested)
 
 
 def share(  # noqa: PLR0917  # the core, and one report

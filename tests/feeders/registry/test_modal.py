@@ -93,6 +93,20 @@ def test_liars_are_named_and_their_voltages_reconstructed() -> None:
     assert frames[0].t == START
 
 
+@pytest.mark.parametrize("factor", [(1.02, 1.03), (0.98, 1.0)])
+def test_false_readings_of_one_tick_are_named_and_forgiven(factor: tuple[float, float]) -> None:
+    """Two meters, or one by its single reading: no transition takes the evidence of the tick away."""
+    frames = list(played(0.0)[0])
+    wrong, at = frames[ONSET].y.copy(), LIARS[:2]
+    wrong[at] *= np.square(factor)
+    frames[ONSET] = replace(frames[ONSET], y=wrong)
+    _, _, verdicts = run(frames)
+    false = {int(j) for j, each in zip(at, factor, strict=True) if each != 1.0}
+    assert set.union(*(named(each) for each in verdicts)) == false
+    assert len(false) == 2 or named(verdicts[ONSET]) == false
+    assert all(each.decision is Decision.CLEAN for each in verdicts[ONSET + 16 :])
+
+
 def test_the_threshold_of_a_masked_meter_is_that_of_its_release() -> None:
     """A power without a reading is an unknown direction of each tick; the lie ends while it is unread."""
     attacked_, honest = played()[0], played(0.0)[0]

@@ -43,7 +43,7 @@ def explanation(given: SearchProblem, accused: Bools, *, power: bool = False) ->
 
 def contested(given: Identification, masked: Bools, most: int, *, powers: bool = False) -> Bools:
     """Named meters that other explanations replace, (p,)."""
-    return given.named & ~collusion.weighed(given, masked, near(most, powers=powers))[0].named
+    return given.named & ~collusion.weighed(given, masked, near(most, powers=powers)).found.named
 
 
 def near(most: int, *, powers: bool = False) -> Neighbourhoods:
@@ -150,14 +150,13 @@ def test_a_known_set_is_improved_within_the_promise() -> None:
 
 
 def test_sets_that_keep_names_are_known_to_the_next_search() -> None:
-    """The sets come back with the explanations; none where no name is kept."""
+    """The sets come back beside the explanations; none where no name is kept."""
     given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
-    _, sets = collusion.weighed(explanation(given, some(4, 5)), NONE, near(4))
-    assert sets.tolist() == [some(0, 1, 2, 3).tolist()]
-    _, again = collusion.weighed(explanation(given, some(4, 5)), NONE, near(4), known=sets)
-    assert again.tolist() == sets.tolist()
-    _, none = collusion.weighed(explanation(given, some(0)), NONE, near(4))
-    assert not len(none)
+    first = collusion.weighed(explanation(given, some(4, 5)), NONE, near(4))
+    assert [each.tolist() for each in first.replacing] == [some(0, 1, 2, 3).tolist()]
+    again = collusion.weighed(explanation(given, some(4, 5)), NONE, near(4), known=first.replacing)
+    assert [each.tolist() for each in again.replacing] == [some(0, 1, 2, 3).tolist()]
+    assert not collusion.weighed(explanation(given, some(0)), NONE, near(4)).replacing
 
 
 def test_an_honest_meter_amid_colluding_ones_is_contested() -> None:
@@ -228,7 +227,7 @@ def test_the_evidence_against_meters_that_a_set_lacks_is_compared(
 def test_a_set_that_contests_a_part_is_reported() -> None:
     """The meter that both explanations accuse stays named."""
     given = street(0.8 * some(0, 1, 2) + 0.6 * some(3))
-    out, _ = collusion.weighed(explanation(given, some(3, 4, 5)), NONE, near(4))
+    out = collusion.weighed(explanation(given, some(3, 4, 5)), NONE, near(4)).found
     assert (out.named == some(3)).all()
     assert (out.chosen[1, :METERS] == some(0, 1, 2, 3)).all()
 
@@ -238,7 +237,7 @@ def test_one_set_without_the_meters_accused_is_reported_alone() -> None:
     given, accused = street(0.8 * some(0, 1, 2) + 0.6 * some(3), 3), some(3, 4, 5)
     likelier, other = evidence(given, np.stack([some(0, 1, 2, 3), some(0, 1, 2)]))
     assert likelier < other
-    out, _ = collusion.weighed(explanation(given, accused), NONE, near(4))
+    out = collusion.weighed(explanation(given, accused), NONE, near(4)).found
     assert not out.named.any()
     assert len(out.chosen) == 2
     assert not (out.chosen[1, :METERS] & accused).any()
@@ -286,6 +285,8 @@ def test_an_explanation_beyond_the_promise_names_nothing() -> None:
     four = explanation(given, some(0, 1, 6, 7))
     assert not contested(four, NONE, 1).any()
     assert (contested(four, some(11), 1) == four.named).all()
+    beside = explanation(busbar(2.0 * some(0, 1, 6, 7).astype(np.float64)), some(0, 1, 6, 7), power=True)
+    assert collusion.weighed(beside, some(11), near(1)).contested[-1]
 
 
 def test_nothing_named_is_not_contested() -> None:
@@ -293,7 +294,7 @@ def test_nothing_named_is_not_contested() -> None:
     given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
     shown = explanation(given, some(4, 5))
     nothing = Identification(shown.chosen, shown.model, shown.weight, NONE, shown.problems)
-    assert collusion.weighed(nothing, NONE, near(4))[0] is nothing
+    assert collusion.weighed(nothing, NONE, near(4)).found is nothing
 
 
 def test_a_false_power_beside_it_protects_no_manipulated_meter() -> None:
@@ -308,7 +309,7 @@ def test_a_false_power_beside_it_protects_no_manipulated_meter() -> None:
 def test_the_other_set_is_no_likelier_than_the_explanation() -> None:
     """It is reported behind the explanation, also where it fits better."""
     given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
-    out, _ = collusion.weighed(explanation(given, some(4, 5)), NONE, near(4))
+    out = collusion.weighed(explanation(given, some(4, 5)), NONE, near(4)).found
     assert (out.chosen[0, :METERS] == some(4, 5)).all()
     assert (out.chosen[1, :METERS] == some(0, 1, 2, 3)).all()
     assert out.weight[0] > out.weight[1] > 0.4
@@ -335,7 +336,9 @@ def busbar(lie: Floats) -> SearchProblem:
 def test_colluding_meters_contest_the_meter_of_the_busbar(most: int, named: bool) -> None:
     """Four meters are off by one amount: beside a fifth the busbar is named only if five are not promised."""
     given = busbar(0.8 * ~NOT_FIRST + 2.0 * some(6))
-    out, _ = collusion.weighed(explanation(given, some(6), power=True), NONE, near(most))
+    weighed = collusion.weighed(explanation(given, some(6), power=True), NONE, near(most))
+    out = weighed.found
+    assert weighed.contested[-1] == (not named)
     assert (out.weight @ ~out.chosen[:, -1] < DOUBT) == named
     assert (out.named == some(6)).all()
     sets = [np.append(some(6), True), np.append(some(0, 1, 2, 3, 6), False)]
@@ -346,8 +349,8 @@ def test_a_sole_fault_of_the_busbar_is_left_to_the_prior() -> None:
     """Without masked meters it is likelier than four meters; beside a masked one it is contested."""
     given = busbar(0.8 * ~NOT_FIRST)
     one = explanation(given, NONE, power=True)
-    assert collusion.weighed(one, NONE, near(5))[0] is one
-    out, _ = collusion.weighed(one, some(11), near(5))
+    assert collusion.weighed(one, NONE, near(5)).found is one
+    out = collusion.weighed(one, some(11), near(5)).found
     assert out.weight @ ~out.chosen[:, -1] >= DOUBT
 
 
@@ -369,7 +372,7 @@ def test_customers_with_false_powers_contest_an_honest_meter() -> None:
         np.append(some(4), some(7))[None], np.zeros(1, np.intp), np.ones(1), some(4), (given,)
     )
     assert (contested(shown, NONE, 4, powers=True) == some(4)).all()
-    out, _ = collusion.weighed(shown, NONE, near(4, powers=True))
+    out = collusion.weighed(shown, NONE, near(4, powers=True)).found
     assert (out.chosen[1] == np.append(some(1), some(1))).all()
     # The customer's meter is masked already, and its power is free.
     assert (contested(shown, some(1), 4, powers=True) == some(4)).all()
