@@ -25,7 +25,7 @@ from gridsec.interface import Frame
 from gridsec.planning.redundancy import from_busbar
 from gridsec.planning.stealthy_attacks import ErrorBox, PowerErrorModel
 
-__all__ = ["SHARE", "Bases", "box", "false_powers", "line_rows", "squared", "volts_of_lie"]
+__all__ = ["SHARE", "Bases", "box", "false_powers", "line_rows", "operating_frame", "squared", "volts_of_lie"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +88,7 @@ def box(site: Site, *, share: float = SHARE, curves: CurvePositions = CurvePosit
 
     Raises ValueError for an unknown region of the curves.
     """
-    frame = _frame(site, share)
+    frame = operating_frame(site, share)
     return _box(site, curves, frame.p_error, frame.q_error)
 
 
@@ -106,7 +106,7 @@ def false_powers(
 
     Raises ValueError for an unknown customer or region of the curves.
     """
-    frame, silent = _frame(site, share), unread(site)
+    frame, silent = operating_frame(site, share), unread(site)
     p, q = np.maximum(frame.p_error, silent.p_error), np.maximum(frame.q_error, silent.q_error)
     made, owner = _box(site, curves, p, q), np.full(p.size, -1, dtype=np.intp)
     owner[site.meters] = np.arange(site.meters.size)
@@ -123,8 +123,8 @@ def false_powers(
     )
 
 
-def _frame(site: Site, share: float) -> Frame:
-    """Frame of honest meters."""
+def operating_frame(site: Site, share: float) -> Frame:
+    """Frame of honest meters, each load at a share of its peak and each voltage at its base."""
     drawn = np.array([share * row.load_kw for row in site.tables.customers])[site.meters]
     nominal = site.customer_volt[site.meters]
     frame = to_frame(
