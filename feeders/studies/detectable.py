@@ -26,6 +26,7 @@ from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, Problem, raise_if_any
 from gridsec.estimators.modal import estimate, monitor, rivals
 from gridsec.estimators.modal.monitor import ModalDesign
+from gridsec.estimators.sequential.state import settling_s
 from gridsec.interface import Frame
 from gridsec.planning.collusion import Corridor, furthest
 from gridsec.planning.detectability import (
@@ -222,7 +223,7 @@ def watched(site: Site, *, share: float = SHARE) -> Watched:
     *_, unknown = islice(_unknown(made, frame, LONGEST_S), HOURS)
     least, each = _directions(unknown), _unknown(made, frame, settings.tick_s)
     settled = (k for k, more in enumerate(islice(each, SLOWEST)) if _directions(more) <= least)
-    settling = next(settled, SLOWEST)
+    settling = max(next(settled, SLOWEST), round(settling_s(made.front) / settings.tick_s))
     return Watched(made, unknown, model, settling)
 
 
@@ -337,7 +338,7 @@ def _meter(given: _Given, j: int) -> dict[str, Any]:
             "undetected_initial": first.undetected,
             "found_initial": first.found,
         }
-        row |= {f"{name}{suffix}": float(volts_of_lie(base, size)) for name, size in sizes.items()}
+        row |= {f"{name}{suffix}": _volts(base, size) for name, size in sizes.items()}
     return row
 
 
@@ -354,10 +355,15 @@ def _customer(given: _Given, i: int) -> dict[str, Any]:
     return {
         "customer": site.feeder.customers[i],
         "bus": site.feeder.buses[bus],
-        "error": float(volts_of_lie(base, moved + given.spread[bus])),
-        "error_fits": float(volts_of_lie(base, worst_error(given.worst, i, liars).bound)),
-        **{f"error_{name}": float(volts_of_lie(base, size)) for name, size in sizes.items()},
+        "error": _volts(base, moved + given.spread[bus]),
+        "error_fits": _volts(base, worst_error(given.worst, i, liars).bound),
+        **{f"error_{name}": _volts(base, size) for name, size in sizes.items()},
     }
+
+
+def _volts(base: float, size: float) -> float:
+    """A size in volts at nominal voltage; infinite where there is none."""
+    return float(volts_of_lie(base, size)) if math.isfinite(size) else math.inf
 
 
 def _sizes(threshold: Threshold) -> dict[str, float]:

@@ -88,7 +88,7 @@ def box(site: Site, *, share: float = SHARE, curves: CurvePositions = CurvePosit
 
     Raises ValueError for an unknown region of the curves.
     """
-    frame = operating_frame(site, share)
+    frame = _frame(site, share)
     return _box(site, curves, frame.p_error, frame.q_error)
 
 
@@ -106,7 +106,7 @@ def false_powers(
 
     Raises ValueError for an unknown customer or region of the curves.
     """
-    frame, silent = operating_frame(site, share), unread(site)
+    frame, silent = _frame(site, share), unread(site)
     p, q = np.maximum(frame.p_error, silent.p_error), np.maximum(frame.q_error, silent.q_error)
     made, owner = _box(site, curves, p, q), np.full(p.size, -1, dtype=np.intp)
     owner[site.meters] = np.arange(site.meters.size)
@@ -126,10 +126,13 @@ def false_powers(
 def operating_frame(site: Site, share: float) -> Frame:
     """Frame of honest meters, each load at a share of its peak and each voltage at its base."""
     drawn = np.array([share * row.load_kw for row in site.tables.customers])[site.meters]
-    nominal = site.customer_volt[site.meters]
-    frame = to_frame(
-        site, Snapshot(0.0, nominal, drawn, np.full(drawn.size, np.nan), float(site.feeder.base_volt))
-    )
+    volts, none = site.customer_volt[site.meters], np.full(drawn.size, np.nan)
+    return to_frame(site, Snapshot(0.0, volts, drawn, none, float(site.feeder.base_volt)))
+
+
+def _frame(site: Site, share: float) -> Frame:
+    """The same where customers without a meter have the farthest forecast."""
+    frame = operating_frame(site, share)
     unmetered = np.ones(frame.p.size, dtype=np.bool_)
     unmetered[site.meters] = False
     return always(site.forecast, frame, unmetered)

@@ -82,6 +82,8 @@ def rehearse(
         sign, j = rng.choice([-1.0, 1.0]), int(rng.integers(p))
         caught = _named(given, site, share, rng, sign * rng.uniform(0.5, 1.0) * worst(j)).any()
         lies = _large(site, found, rng, j, together=k % 2 == 0)
+        if not lies.any():
+            return [int(caught), 0, 0]
         named = _named(given, site, share, rng, sign * lies)
         return [int(caught), int(not named[j]), int((named & (lies == 0.0)).any())]
 
@@ -90,10 +92,17 @@ def rehearse(
 
 
 def _large(site: Site, found: Detectable, rng: np.random.Generator, j: int, *, together: bool) -> Floats:
-    """Attack on meter j beyond its named size, and on others in collusion; squared pu."""
+    """Attack on meter j beyond its named size, and on others in collusion; squared pu; 0 without a size.
+
+    Others without a named size are attacked by up to twice the size at which they are noticed.
+    """
     column = "named" if together else "named_alone"
     sizes = squared(site.customer_volt[site.meters], found.meters[column].to_numpy())
     lies = np.zeros(sizes.size)
+    if not np.isfinite(sizes[j]):
+        return lies
+    least = squared(site.customer_volt[site.meters], found.meters["noticed_alone"].to_numpy())
+    sizes = np.where(np.isfinite(sizes), sizes, least)
     if together and found.max_attacked > 1:
         others = rng.choice(np.delete(np.arange(sizes.size), j), found.max_attacked - 1, replace=False)
         lies[others] = rng.uniform(-2.0, 2.0, others.size) * sizes[others]
@@ -180,7 +189,7 @@ def promised(site: Site, found: Detectable, *, share: float = SHARE) -> tuple[At
     """Attacks of the sizes of `detectable`, for a campaign.
 
     The feeder has the campaign's errors of loads and meters. For M = 1 there are only attacks on one meter.
-    Kinds without an attack of guaranteed outcome are left out.
+    Kinds without an attack of guaranteed outcome are left out, and kinds where a meter has no size.
 
     Returns hidden_alone, hidden: one meter, and M meters in the worst collusion of this size; no device is to
         be named.
@@ -201,7 +210,9 @@ def promised(site: Site, found: Detectable, *, share: float = SHARE) -> tuple[At
             AttackClass("hidden", AttackKind.BIAS, HIDDEN, (), worst, (most,), Promise.HIDDEN),
             AttackClass("named", AttackKind.BIAS, NAMED, _volts(found, "named"), (), (most,), Promise.NAMED),
         ]
-    return tuple(kind for kind in kinds if any(kind.volts) or kind.together)
+    return tuple(
+        kind for kind in kinds if (any(kind.volts) or kind.together) and np.isfinite(kind.volts).all()
+    )
 
 
 def _volts(found: Detectable, column: str) -> tuple[float, ...]:

@@ -30,6 +30,8 @@ CIGRE = load("cigre-lv")
 DAY_S, LEARN_STEP_S = 86_400.0, 300.0
 LIE = 1024
 """Seconds of a lie: the last age of the study."""
+HELD = 60
+"""Seconds for which a lie that is found is not CLEAN."""
 TIMES = (1.0 + ROOM) / (1.0 - ROOM)
 """1.9: from undetected to found."""
 
@@ -175,7 +177,10 @@ def test_what_the_study_calls_undetected_is_clean_and_nearly_twice_as_much_is_fo
         clean, _ = watched(setting, known, sign * lies)
         assert clean.all()
         clean, _ = watched(setting, known, sign * TIMES * lies)
-        assert not clean[-10:].any()
+        # A named meter is released when it agrees, and such a small lie may.
+        first = int(np.argmin(clean))
+        assert clean.size - first >= HELD
+        assert not clean[first : first + HELD].any()
 
 
 @pytest.mark.canary("cigre-lv-0")
@@ -212,7 +217,7 @@ def test_the_error_of_an_undetected_pair_is_the_one_promised(cigre: Detectable) 
     clean, attacked = watched(setting, known, lies)
     assert clean.all()
     _, honest = watched(setting, known, 0.0 * lies)
-    moved = abs(np.sqrt(attacked[i]) - np.sqrt(honest[i])) * CIGRE.customer_volt[i]
+    moved = float(volts_of_lie(CIGRE.customer_volt[i], abs(attacked[i] - honest[i])))
     assert moved == pytest.approx(row[i], rel=0.05)
     assert cigre.customers["error_unavoidable"][i] < cigre.customers["error_found"][i]
     assert row[0] == 0.0  # at the busbar
