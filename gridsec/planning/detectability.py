@@ -82,8 +82,8 @@ __all__ = [
     "step_tests",
 ]
 
-ROOM = 0.3
-"""Part of every limit for honest residuals, 1: two standard deviations of a Gaussian one; measured, 0.14."""
+ROOM = 0.4
+"""Part of every limit for honest residuals, 1: 2.7 standard deviations of a Gaussian one, at every tick."""
 AGES = (16, 1024)
 """Ages of a step at which it is tested, ticks: a step of an hour is 3 % smaller than one of the last age."""
 INITIAL = (64,)
@@ -543,7 +543,8 @@ class NamedSizes:
 
     Rivals J are those of a descent without k, under the model of the loads, and under a jump of all loads at
     the onset. With M meters the M - 1 others have any amounts, and J may do without them: b_J grows by
-    their penalties, for amounts up to `OTHERS` times their own sizes.
+    their penalties, for amounts up to `OTHERS` times their own sizes. The other meters of a phase, with the
+    busbar's, are an image of the meter. They are a rival of any step where no more than the promised number.
 
     Parameters
     ----------
@@ -560,6 +561,8 @@ class NamedSizes:
         self.meters, self.bound = made.size, core.bound
         self.away = sqrt(2.0 * log(1.0 / risk))
         columns = made.back @ faults.W
+        phases = made.phases > 0.0
+        self.alike, self.promised = phases @ np.count_nonzero(phases, axis=0), core.near.most
         self.F = [columns.T @ each.information @ columns for each in (plain, jumped)]
         self.covariance = np.linalg.inv(plain.information)
         volume = [float(np.linalg.slogdet(each.information)[1]) for each in (plain, jumped)]
@@ -578,6 +581,8 @@ class NamedSizes:
         least
             Size at which the step is noticed, squared pu.
         """
+        if self.alike[meter] - 1 <= self.promised:
+            return np.inf
         size = self._size(meter, np.zeros(0, np.intp), least)
         if liars > 1:
             F = self.F[0][: self.meters, : self.meters]

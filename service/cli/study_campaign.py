@@ -317,7 +317,7 @@ def _print(found: Campaign, output: Output) -> None:
 def _with_promised(
     site: Site, plan: CampaignPlan, others: tuple[AttackClass, ...], kept: Keeping
 ) -> CampaignPlan:
-    from feeders.studies.campaign.guarantees import promised
+    from feeders.studies.campaign.guarantees import earliest_s, promised
     from feeders.studies.detectable import detectable, workers
 
     stated = plan.trial(site, plan.moment(0)).stated
@@ -325,7 +325,10 @@ def _with_promised(
         found = detectable(
             stated, max_attacked=2, runner=workers(stated, None), journal=kept, progress=report_progress
         )
-    return replace(plan, kinds=(*others, *promised(stated, found)))
+    low, high = plan.onset_s
+    least = earliest_s(stated)
+    onset_s = max(low, least), max(high, least)
+    return replace(plan, kinds=(*others, *promised(stated, found)), onset_s=onset_s)
 
 
 def _short(table: pd.DataFrame) -> pd.DataFrame:

@@ -26,7 +26,7 @@ from gridsec.estimators.sequential.posterior import LoadDoubt
 from gridsec.interface import Frame
 from gridsec.planning.detectability import QUIET
 
-__all__ = ["Rehearsal", "promised", "rehearse"]
+__all__ = ["Rehearsal", "earliest_s", "promised", "rehearse"]
 
 
 _LYING = 16  # frames from the onset of an attack on
@@ -97,12 +97,12 @@ def _large(site: Site, found: Detectable, rng: np.random.Generator, j: int, *, t
     Others without a named size are attacked by up to twice the size at which they are noticed.
     """
     column = "named" if together else "named_alone"
-    sizes = squared(site.customer_volt[site.meters], found.meters[column].to_numpy())
-    lies = np.zeros(sizes.size)
-    if not np.isfinite(sizes[j]):
+    volts = found.meters[column].to_numpy()
+    lies = np.zeros(volts.size)
+    if not np.isfinite(volts[j]):
         return lies
-    least = squared(site.customer_volt[site.meters], found.meters["noticed_alone"].to_numpy())
-    sizes = np.where(np.isfinite(sizes), sizes, least)
+    volts = np.where(np.isfinite(volts), volts, found.meters["noticed_alone"].to_numpy())
+    sizes = squared(site.customer_volt[site.meters], volts)
     if together and found.max_attacked > 1:
         others = rng.choice(np.delete(np.arange(sizes.size), j), found.max_attacked - 1, replace=False)
         lies[others] = rng.uniform(-2.0, 2.0, others.size) * sizes[others]
@@ -213,6 +213,15 @@ def promised(site: Site, found: Detectable, *, share: float = SHARE) -> tuple[At
     return tuple(
         kind for kind in kinds if (any(kind.volts) or kind.together) and np.isfinite(kind.volts).all()
     )
+
+
+def earliest_s(site: Site, *, share: float = SHARE) -> float:
+    """Time after the start of the monitor from which on attacks are those of the study, s.
+
+    The observer of the inverters has settled, and `QUIET` further readings are honest.
+    """
+    given = watched(site, share=share)
+    return (given.settling + QUIET) * given.step_s
 
 
 def _volts(found: Detectable, column: str) -> tuple[float, ...]:
