@@ -544,7 +544,7 @@ class NamedSizes:
     Rivals J are those of a descent without k, under the model of the loads, and under a jump of all loads at
     the onset. With M meters the M - 1 others have any amounts, and J may do without them: b_J grows by
     their penalties, for amounts up to `OTHERS` times their own sizes. The other meters of a phase, with the
-    busbar's, are an image of the meter. They are a rival of any step where no more than the promised number.
+    busbar's, are an image of the meter. Where they are no more than promised, they are a rival of any step.
 
     Parameters
     ----------
