@@ -1,21 +1,15 @@
 """Worlds, monitors and acceptance regions of `benchmarks.adversary`.
 
-The acceptance region of the sequential monitor is `gridsec.planning.detectability.acceptance_region`. That of
-the statistical core for a step of age n is, with the exact information I of all modes at that onset,
-
-    members:  |(U I U' a)_j| <= y_j,  y_j: log Lambda(y_j, F_jj) = log gamma - log(weight capital / p)
-    omnibus:  a' U I M I U' a <= 2 (log gamma - log(weight capital)) + log det,
-
-M being the quadratic form of `gridsec.estimators.modal.detector.omnibus`. The powers' part of the test is
-left out. Other estimators of the registry are played with the attacks made for the sequential monitor.
+The acceptance region of the statistical core for a step of one age is
+`gridsec.planning.detectability.acceptance_region`. That of the sequential monitor is here. Other estimators
+of the registry are played with the attacks made for the sequential monitor.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from math import log
 from typing import Any
 
 import numpy as np
@@ -25,12 +19,20 @@ from feeders.model.site import Site, Snapshot, from_tables, late
 from feeders.registry import SEQUENTIAL, DesignedEstimator, design
 from feeders.simulation.scenario import START
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.estimators.modal import detector, estimate, signatures
+from gridsec.estimators.modal import detector
 from gridsec.estimators.modal.core import Core, CoreState
 from gridsec.estimators.sequential import SequentialDesign, SequentialState
-from gridsec.estimators.sequential.time_scales import Scales
+from gridsec.estimators.sequential.posterior import condition
+from gridsec.estimators.sequential.time_scales import (
+    Scales,
+    chi_square_limit,
+    score_limit,
+    score_rows,
+    scored,
+)
 from gridsec.grid.network import Power
 from gridsec.interface import Decision, Frame
+from gridsec.planning.detectability import acceptance_region
 from gridsec.planning.unavoidable import AcceptanceRegion, Faults
 
 LATE_S = 60.0
@@ -168,6 +170,60 @@ def scales(made: SequentialDesign, state: SequentialState) -> Scales:
     return Scales(made, state.uncertainty, state.window, state.learned, state.model_error)
 
 
+def sequential_region(
+    scales: Scales, *, misfit: bool = True, busbar: bool = True, levels: Sequence[float] | None = None
+) -> AcceptanceRegion:
+    """Displacements of all residuals that no test of the monitor rejects, all meters trusted.
+
+    The limit of the misfit is that of ``sqrt(m' Q m)``: with the honest part of m it is at most the sum of
+    both roots.
+
+    scales: the scales at one moment.
+    misfit, busbar: use the tests of the misfit and of the busbar's meter.
+    levels (s,): largest mean of the displacement on each scale, as a part of its largest value; None for a
+        constant displacement. A scale of level 0 does not test.
+    """
+    design, model = scales.design, scales.model
+    every = np.ones(model.size, dtype=np.bool_)
+    rows, forms = [], []
+    for s, level in enumerate([1.0] * len(design.lengths) if levels is None else levels):
+        if level <= 0.0:
+            continue
+        here = scales[s]
+        now = condition(here.prior, here.noise, every)
+        Q, std = now.Q, np.sqrt(1.0 / now.diagonal())
+        rows.append(level * Q * (std**2 / here.limits.limit(std))[:, None])
+        if misfit:
+            error, tail = np.sqrt(model @ np.abs(Q) @ model), design.tails[s]
+            if scored(design):
+                tail = 0.5 * tail
+                rows.append(
+                    level * (score_rows(design, Q) @ Q) / (score_limit(design.customers, tail) + error)
+                )
+            root = np.sqrt(chi_square_limit(model.size, tail)) + error
+            forms.append(level * np.linalg.cholesky(Q).T / root)
+        if busbar:
+            incidence = design.busbar_incidence
+            together = incidence.T @ Q
+            form = np.sqrt(np.einsum("bp,pb->b", together, incidence))
+            some = form > 0.0
+            rows.append(level * together[some] / (design.sigmas[s] * form[some])[:, None])
+    last = scales[len(design.lengths) - 1]
+    gain = condition(last.prior, last.noise, every)
+    return AcceptanceRegion(np.vstack(rows), tuple(forms), last.prior.covariance @ gain.Q)
+
+
+def honest_covariance(scales: Scales, ticks: int) -> tuple[Floats, Floats]:
+    """Covariance of a mean of honest residuals, (p, p), and that of the places' voltages with it, (n, p).
+
+    scales: the scales at one moment.
+    ticks: length of the mean, with all readings.
+    """
+    design, prior = scales.design, scales[len(scales.design.lengths) - 1].prior
+    V = prior.between + np.diag(scales.learned.variance + design.white / ticks)
+    return V, prior.covariance
+
+
 def core_region(kernel: Core, state: CoreState, age: int) -> AcceptanceRegion:
     """Steps of a given age that the core accepts, all readings complete.
 
@@ -178,29 +234,9 @@ def core_region(kernel: Core, state: CoreState, age: int) -> AcceptanceRegion:
     age
         Ticks since the onset, its own included.
     """
-    modes, test = kernel.modes, detector.followed(kernel.modes, state.detector)
-    rows = np.flatnonzero(test.onsets.used & ~test.onsets.ramp)
-    row = int(rows[np.argmin(np.abs(test.onsets.age[rows] - age))])
-    joint, capital = signatures.joint(modes, test.onsets, state.static, row), test.capital[:, row]
-    left = kernel.limit - np.log(np.array(detector.WEIGHTS)) - capital
-    scored = joint.information @ modes.U.T
-    members = modes.U @ scored
-    s2, F = detector.SIZE**2, members.diagonal()
-    spread = 1.0 + s2 * F
-    y = np.sqrt(2.0 * spread / s2 * (left[0] + log(modes.size) + 0.5 * np.log(spread)))
-    now = signatures.scores(modes, test.onsets, state.static, np.array([row]))
-    size = s2 / modes.white
-    more = 1.0 + size * now.information[0]
-    M, offset = np.diag(size / more), float(np.log(more).sum())
-    if now.cov.size:
-        pull = now.side[0] * (size / more)
-        rest = np.eye(len(now.cov)) - now.cov @ (pull @ now.side[0].T)
-        M += pull.T @ np.linalg.solve(rest, now.cov) @ pull
-        offset += float(np.linalg.slogdet(rest)[1])
-    half = np.linalg.cholesky(M).T @ scored / np.sqrt(2.0 * left[1] + offset)
-    zero = np.zeros((len(kernel.effect), modes.size))
-    T = estimate.moves(modes, kernel.estimator, state.filter, joint, modes.U.T, zero)
-    return AcceptanceRegion(members / y[:, None], (half,), T)
+    onsets = detector.followed(kernel.modes, state.detector).onsets
+    rows = np.flatnonzero(onsets.used & ~onsets.ramp)
+    return acceptance_region(kernel, state, int(rows[np.argmin(np.abs(onsets.age[rows] - age))]))
 
 
 # --- faults -------------------------------------------------------------------------------------

@@ -54,8 +54,10 @@ from benchmarks._adversary import (
     core_region,
     falsified,
     faults,
+    honest_covariance,
     learning,
     scales,
+    sequential_region,
 )
 from benchmarks._arguments import count
 from benchmarks._scenes import (
@@ -74,7 +76,6 @@ from gridsec.estimators import sequential
 from gridsec.estimators.modal.monitor import ModalDesign
 from gridsec.estimators.sequential import SequentialState
 from gridsec.interface import Decision, Frame
-from gridsec.planning.detectability import acceptance_region, honest_covariance
 from gridsec.planning.unavoidable import (
     AcceptanceRegion,
     ConeProgram,
@@ -295,7 +296,7 @@ class Scene:
         sums = np.concatenate([[0.0], np.cumsum(level)])
         ends = [np.abs(sums[n:] - sums[:-n]).max() / n for n in self.made.lengths]
         now = scales(self.made, self.front)
-        return acceptance_region(now, misfit=self.kind.misfit, levels=[float(end) for end in ends])
+        return sequential_region(now, misfit=self.kind.misfit, levels=[float(end) for end in ends])
 
     def attacks(self, pattern: Pattern) -> Iterator[tuple[float, Floats]]:
         """Shares of the limits and amounts of the faults."""

@@ -1,4 +1,4 @@
-"""Lies of the sizes that `gridsec study detectable` promises, watched by the sequential monitor itself.
+"""Lies of the sizes that `gridsec study detectable` promises, watched by the monitor `modal` itself.
 
     python -m benchmarks.promised_lies [trials] [feeder ...]
 

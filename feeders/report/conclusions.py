@@ -137,11 +137,13 @@ def _largest(table: pd.DataFrame, name: str, column: str, where: str) -> Sentenc
 def _detectable(site: Site, found: Detectable) -> Sentence:
     meters, liars = found.meters, found.max_attacked
     return sentence(
-        "with {liars}, every attack is noticed from {noticed} on, no other explanation is left "
-        "from {named} on, and an unnoticed one shifts a shown voltage by at most {error}{levels}",
+        "with {liars}, every attack is noticed from {noticed} on and its meter named from {named} on before "
+        "fixed errors are learned; once they are, every attack is found from {found} on; an unnoticed one "
+        "shifts a shown voltage by at most {error}{levels}",
         liars=f"up to {liars} manipulated {plural(liars, 'meter')}",
         noticed=_largest(meters, "detectable-meters", "noticed", "meter"),
         named=_largest(meters, "detectable-meters", "named", "meter"),
+        found=_largest(meters, "detectable-meters", "found", "meter"),
         error=_largest(found.customers, "detectable-customers", "error", "customer"),
         levels=_levels(site, "each place"),
     )

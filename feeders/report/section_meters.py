@@ -28,6 +28,7 @@ from feeders.report.text import (
 )
 from feeders.report.text import rows as how_many
 from feeders.studies.protect import Goal
+from gridsec.planning.detectability import QUIET, ROOM, SINCE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -126,7 +127,7 @@ def detectable(site: Site, found: Detectable) -> Section:
     once, twice = _sure(found.risk), _sure(2.0 * found.risk)
     return Section(
         answers={
-            Question.LIES: _sizes(site, found.meters, found.max_attacked, (once, twice)),
+            Question.LIES: _sizes(site, found.meters, found.max_attacked, once),
             Question.PICTURE: _picture(site, found.customers, found.max_attacked, twice),
         },
         figures=_size_figures(site, found, once, twice),
@@ -143,9 +144,9 @@ def _size_figures(site: Site, found: Detectable, once: str, twice: str) -> tuple
         Figure(
             "detectable-sizes",
             "Outcome of an attack, by its size",
-            f"Each meter manipulated {together}. Left: no meter is named. Middle: depends on the honest "
-            "errors of the moment. Right: noticed, but another meter may be named. Beyond the number no "
-            f"explanation without the manipulated meter remains.{_largest_only(meters)}",
+            f"Each meter manipulated {together}. Before fixed errors are learned. Left: no meter is named. "
+            "Middle: depends on the honest errors of the moment. Right: noticed, but not named for sure. "
+            f"Beyond the number the meter is named.{_largest_only(meters)}",
             partial(_sizes_chart, meters, unit=unit),
         ),
         Figure(
@@ -161,7 +162,7 @@ def _size_figures(site: Site, found: Detectable, once: str, twice: str) -> tuple
             "detectable-picture",
             "Errors of the shown voltages",
             f"Largest error of each customer's reconstructed voltage, with {twice}, under {liars} unnoticed "
-            f"{plural(liars, 'manipulated meter')}, {unit}. "
+            f"{plural(liars, 'manipulated meter')}, before fixed errors are learned, {unit}. "
             f"Largest at {_extreme(customers, 'customer', 'error')}.",
             partial(size_map, site, customers, who="customer", column="error", unit=unit),
         ),
@@ -173,7 +174,8 @@ def _assumed(site: Site, found: Detectable, once: str) -> tuple[str, ...]:
     return (
         f"At most {liars} manipulated {plural(liars, 'meter', 'meters together')}; attackers know "
         "the feeder, but not the honest errors of the moment.",
-        "Sequential monitor, before it has learned the fixed errors of its meters; "
+        f"Estimator modal. Hidden, noticed and named: fixed errors not learned, {QUIET} honest readings, "
+        f"at reading {SINCE} of the attack; "
         f"{'balanced' if single_phase(site) else 'three-phase'} model; "
         "inverters in their deadbands; nominal voltage.",
         f"Sizes for the monitor hold with {once} at any one moment: honest errors Gaussian or uniform "
@@ -182,6 +184,8 @@ def _assumed(site: Site, found: Detectable, once: str) -> tuple[str, ...]:
         "Proofs are for the linear effect of load errors; AC power flow was only simulated.",
         "Identification of the manipulated meter by the monitor's search, at this and later moments, is not "
         "proved but was checked by simulation (gridsec study detectable --trials, and campaigns).",
+        f"Undetected and found, with errors learned: {100.0 * ROOM:g} % of every limit is left to honest "
+        "residuals. Measured, not proved.",
         "After a stopped search for the worst collusion, sizes are the limits proved until then: on the "
         "safe side.",
     )
@@ -203,7 +207,7 @@ def _span(
     return (low, f" ({at}{first}) to ", high, f" ({at}{last})")
 
 
-def _sizes(site: Site, meters: pd.DataFrame, liars: int, sure: tuple[str, str]) -> Finding:
+def _sizes(site: Site, meters: pd.DataFrame, liars: int, sure: str) -> Finding:
     name = "detectable-meters"
     levels = f" Volts are those of each meter's own level{_percent(site)}." if _percent(site) else ""
     lead = sentence(
@@ -212,7 +216,7 @@ def _sizes(site: Site, meters: pd.DataFrame, liars: int, sure: tuple[str, str]) 
         meters=how_many(meters, name),
         together="alone" if liars == 1 else f"with up to {liars} manipulated together",
         span=_span(meters, name, "hidden", "meter", digits=3, side=Side.BELOW),
-        sure=sure[0],
+        sure=sure,
         levels=levels,
     )
     never = meters[[math.isinf(v) or math.isnan(v) for v in meters["noticed"]]]
@@ -223,19 +227,24 @@ def _sizes(site: Site, meters: pd.DataFrame, liars: int, sure: tuple[str, str]) 
         )
         return Finding(Standing.PART, (lead, unnoticed))
     noticed = sentence(
-        "Larger attacks may stay unnoticed too, depending on the honest errors of the moment. A meter "
-        "exceeds a limit of the monitor, with the same probability, from {span} on.",
+        "Larger attacks may stay unnoticed too, depending on the honest errors of the moment. Before fixed "
+        "errors are learned, the monitor detects them, with the same probability, from {span} on.",
         span=_span(meters, name, "noticed", "meter"),
     )
-    named: Sentence = ("Not every manipulated meter is proved to be named, for any size of the attack.",)
+    named: Sentence = ("Not every manipulated meter is named, for any size of the attack.",)
     if all(math.isfinite(v) for v in meters["named"]):
         named = sentence(
-            "No explanation without the manipulated meter remains from {span} on, with {sure}. This is "
-            "proved; the identification by the monitor's search is not, but was checked by simulation.",
+            "The monitor's search names the manipulated meter from {span} on. This is not proved, but was "
+            "checked by simulation.",
             span=_span(meters, name, "named"),
-            sure=sure[1],
         )
-    return Finding(Standing.PART, (lead, noticed, named))
+    learned = sentence(
+        "Once fixed errors are learned, attacks of {least} may stay undetected, and larger ones than {most} "
+        "are found.",
+        least=_span(meters, name, "undetected", digits=3, side=Side.BELOW),
+        most=_span(meters, name, "found", digits=3),
+    )
+    return Finding(Standing.PART, (lead, noticed, named, learned))
 
 
 def _picture(site: Site, customers: pd.DataFrame, liars: int, sure: str) -> Finding:
@@ -301,7 +310,7 @@ def _sizes_chart(meters: pd.DataFrame, width: float, *, unit: str) -> Drawing:
                 max(b, c),
                 "band2",
                 "noticed, another may be named",
-                f"no explanation without it from {number(row['named'], 2, Side.ABOVE)} {unit} on",
+                f"named from {number(row['named'], 2, Side.ABOVE)} {unit} on",
             ),
         )
         data.append(ChartRow(str(row["meter"]), bars, f"{number(row['named'], 2, Side.ABOVE)} {unit[0]}"))

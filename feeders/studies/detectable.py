@@ -1,43 +1,59 @@
-"""Sizes of attacks that stay unnoticed, are noticed and are named, in volts; resulting estimation errors.
+"""Sizes of attacks that stay undetected, are found and are named, in volts; resulting estimation errors.
 
-References: docs/theory-studies.md, sections 3 and 5.
+The sizes are those of the statistical core, the estimator `modal`. References: docs/theory-studies.md,
+sections 3, 5 and 7.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from itertools import count, islice
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from feeders.format.tables import FeederTables
-from feeders.model.site import Site, from_tables, load_doubt, plant
-from feeders.studies.operating import SHARE, box, volts_of_lie
+from feeders.model.site import Site, from_tables
+from feeders.registry import MODAL, design
+from feeders.studies.operating import SHARE, box, operating_frame, volts_of_lie
 from feeders.studies.running import Here, Progress, Runner, Where, cores, run_pieces
 from feeders.studies.unobservable import CurvePositions
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, Problem, raise_if_any
-from gridsec.estimators.sequential import SequentialOptions
-from gridsec.estimators.sequential import design as design_sequential
+from gridsec.estimators.modal import estimate, monitor, rivals
+from gridsec.estimators.modal.monitor import ModalDesign
+from gridsec.estimators.sequential.state import settling_s
+from gridsec.interface import Frame
 from gridsec.planning.collusion import Corridor, furthest
 from gridsec.planning.detectability import (
+    AGES,
+    HONEST,
+    INITIAL,
+    LONGEST_S,
+    QUIET,
+    SINCE,
+    Known,
     MonitorTests,
-    Rule,
+    NamedSizes,
+    StepTests,
     Threshold,
-    learned_scales,
-    named_size,
-    rule,
-    within,
+    hidden_norm,
+    hidden_step,
+    known,
+    noticed,
+    step_tests,
 )
 from gridsec.planning.stealthy_attacks import ErrorBox, largest_lie, worst_error
 
-__all__ = ["Detectable", "detectable", "monitor_rule", "workers"]
+__all__ = ["Detectable", "Watched", "detectable", "hidden_attack", "watched", "workers"]
 
-RISK = 1e-3  # probability at one moment that honest errors exceed the monitor's limits
+RISK = 1e-3  # probability at one moment that honest errors decide otherwise
+HOURS = 3  # frames, an hour apart, after which the observer of the inverters has settled
+SLOWEST = 600  # largest number of readings in which the observer settles
 MANY = 50  # number of meters from which on several processes are faster than one
 
 
@@ -49,25 +65,32 @@ class Detectable:
     digest: str
     max_attacked: int
     risk: float
-    # one row for each meter, `alone` or in collusion with M - 1 others of the attacker's choice: -
-    # `hidden_alone`, `hidden`: up to this size, with probability `1 - risk` at any one moment, no meter
-    # exceeds the sequential monitor's limits, so that no meter is named; - `noticed_alone`, `noticed`: beyond
-    # this size a meter does, with that probability; - `named_alone`, `named`: beyond this size, with
-    # probability `1 - 2 risk`, no explanation that trusts the meter is a rival, and it exceeds its limit; -
-    # `fits_alone`, `fits`: the largest attack that is consistent with an honest feeder, all errors within
-    # their worst cases: no test without false alarms is sure to detect it; every larger one is inconsistent;
+    # One row for each meter, `alone` or in collusion with M - 1 others of the attacker's choice.
+    # Before fixed errors are learned, for an attack that begins after `QUIET` honest readings:
+    # - `hidden_alone`, `hidden`: up to this size no meter is suspected or named at a moment, with probability
+    #   `1 - risk`; also once errors are learned;
+    # - `noticed_alone`, `noticed`: beyond this size the attack is detected at its reading number `SINCE`,
+    #   with probability `1 - risk`;
+    # - `named_alone`, `named`: beyond this size the search names the meter then; simulated, not proved;
+    # - `undetected_initial`, `found_initial` and both `_alone`: as `undetected` and `found`, for an attack
+    #   that begins with the first reading: fixed errors are known by their class only.
+    # In worst cases:
+    # - `fits_alone`, `fits`: the largest attack that is consistent with an honest feeder: no test without
+    #   false alarms is sure to detect it; every larger one is inconsistent;
     # - `identified_alone`, `identified`: for every larger attack, all explanations by at most M meters accuse
-    # this meter; - `undetected_alone`, `undetected`: once fixed errors are learned, the largest attack within
-    # the limits of all tests of the monitor, the misfit's included, with a fifth of each limit left to honest
-    # residuals; - `found_alone`, `found`: every larger attack exceeds a limit by more than a fifth of it; -
-    # `unavoidable_alone`, `unavoidable`: no test with the same rate of false alarms detects this size, by the
-    # meters of `undetected`, more often than every second time
+    #   this meter.
+    # Once fixed errors are learned:
+    # - `undetected_alone`, `undetected`: the largest attack that stays CLEAN, with the part `ROOM` of every
+    #   limit left to honest residuals;
+    # - `found_alone`, `found`: every larger attack exceeds a limit by this part;
+    # - `unavoidable_alone`, `unavoidable`: no test with the same rate of false alarms detects this size, by
+    #   the meters of `undetected`, more often than every second time.
     meters: pd.DataFrame
-    # one row for each customer: `error`, the largest error of the sequential monitor's reconstruction under M
-    # unnoticed manipulated meters; `error_fits`, the largest distance of two voltages that are consistent
-    # with the same readings; `error_undetected`, `error_found` and `error_unavoidable`: errors by attacks
-    # within the limits less a fifth, beyond the limits by a fifth, and undetected by every test, once fixed
-    # errors are learned
+    # One row for each customer: `error`, the largest error of the estimate under M manipulated meters that
+    # are not noticed before errors are learned; `error_fits`, the largest distance of two voltages that are
+    # consistent with the same readings; `error_undetected`, `error_found` and `error_unavoidable`: errors by
+    # attacks of these sizes once errors are learned; `error_undetected_initial`, `error_found_initial`: by
+    # attacks that begin with the first reading.
     customers: pd.DataFrame
     share: float = SHARE
 
@@ -133,35 +156,139 @@ def workers(site: Site, count: int | None) -> Runner:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Watched:
+    """Monitor `modal` of a feeder at the operating point of a study. n places, p meters."""
+
+    design: ModalDesign
+    unknown: Floats | None  # (p, k) directions that each frame leaves unknown; None for none
+    model: Floats  # (N,) error of the model at each customer, squared pu
+    settling: int  # readings after a start until no frame leaves more unknown: inverters have settled
+
+    @property
+    def step_s(self) -> float:
+        """Interval of the readings, s."""
+        return self.design.front.step_s
+
+    @property
+    def alarms_per_year(self) -> float:
+        """Permitted false alarms in a year."""
+        return self.design.options.alarms_per_year
+
+    def known(self, ticks: int, *, learned: bool = False) -> Known:
+        """Filter after some honest readings, and after the time of commissioning before them."""
+        learned_s = self.design.options.commission_s if learned else 0.0
+        return known(self.design.core, ticks, self.step_s, learned_s=learned_s, unknown=self.unknown)
+
+    def steps(self, before: Known, ages: tuple[int, ...], *, jump: float = 0.0) -> tuple[StepTests, ...]:
+        """Tests of a step at some ages, within an hour."""
+        last = max(1, int(LONGEST_S / self.step_s))
+        some = sorted({min(age, last) for age in ages})
+        return step_tests(self.design.core, before, some, self.step_s, unknown=self.unknown, jump=jump)
+
+    def tests(self, steps: tuple[StepTests, ...]) -> MonitorTests:
+        """Tests of all ages together."""
+        return MonitorTests.of(steps, self.alarms_per_year, self.step_s)
+
+    @property
+    def learned(self) -> tuple[StepTests, ...]:
+        """Tests of a step once fixed errors are learned."""
+        return self.steps(self.known(HONEST, learned=True), AGES)
+
+    @property
+    def initial(self) -> tuple[StepTests, ...]:
+        """Tests of a step from the first reading on."""
+        return self.steps(self.known(0), INITIAL)
+
+
+def watched(site: Site, *, share: float = SHARE) -> Watched:
+    """Monitor of a feeder with the settings of its files, and what its frames leave unknown.
+
+    Raises NotObservable, DesignInfeasible if the feeder cannot be monitored.
+    """
+    tables = site.tables
+    settings = replace(tables.meta.monitor, estimator=MODAL)
+    made = design(from_tables(replace(tables, meta=replace(tables.meta, monitor=settings)))).design
+    p = -share * site.loads.load_peak
+    q = 0.5 * (site.loads.tan_min + site.loads.tan_max) * p
+    model = site.feeder.model_error_bound(p, q, 1.0)
+    if not np.isfinite(model[site.meters]).all():
+        raise DesignInfeasible(
+            f"sizes of {site.feeder.name}'s monitor",
+            f"no power flow at {share:g} of the peak",
+            code="not-converged",
+        )
+    frame, phases = operating_frame(site, share), site.feeder.busbar_places().stop
+    if phases > 1:
+        frame = replace(frame, v0_phases=np.ones(phases))
+    *_, unknown = islice(_unknown(made, frame, LONGEST_S), HOURS)
+    least, each = _directions(unknown), _unknown(made, frame, settings.tick_s)
+    settled = (k for k, more in enumerate(islice(each, SLOWEST)) if _directions(more) <= least)
+    settling = max(next(settled, SLOWEST), round(settling_s(made.front) / settings.tick_s))
+    return Watched(made, unknown, model, settling)
+
+
+def _unknown(made: ModalDesign, frame: Frame, step_s: float) -> Iterator[Floats | None]:
+    """Directions that equal frames leave unknown, one after another from the start of the monitor on."""
+    state = monitor.init(made, 0.0)
+    for k in count():
+        state, _, _ = monitor.step(made, state, replace(frame, t=k * step_s))
+        yield state.core.history.readings[-1][3]
+
+
+def _directions(unknown: Floats | None) -> int:
+    return 0 if unknown is None else unknown.shape[1]
+
+
+def hidden_attack(tests: MonitorTests, watch: Watched, meter: int, liars: int, risk: float) -> Floats:
+    """Largest attack on a meter that stays hidden, with M - 1 others, (p,), squared pu."""
+    norm = hidden_norm(watch.alarms_per_year, watch.step_s, risk)
+    return hidden_step(tests.information, meter, liars, norm)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Given:
-    """Common data of all rows. Corridors are by detection and number of manipulated meters."""
+    """Common data of all rows. Corridors are by the number of manipulated meters."""
 
     site: Site
+    watch: Watched
     max_attacked: int
-    rule: Rule
-    corridors: Mapping[tuple[bool, int], Corridor]
+    risk: float
     worst: ErrorBox
-    claims: Floats
-    tests: MonitorTests
-    learned: Mapping[int, Corridor]
+    named: NamedSizes
+    unnoticed: Mapping[int, Corridor]
+    weights: Floats  # (ages, n, p) change of the estimate per step, before errors are learned
+    spread: Floats  # (n,) honest error of the estimate then, squared pu
+    learned: tuple[MonitorTests, Mapping[int, Corridor]]
+    initial: tuple[MonitorTests, Mapping[int, Corridor]]
 
     @classmethod
     def of(cls, site: Site, max_attacked: int, share: float, risk: float) -> _Given:
-        given = monitor_rule(site, risk=risk, share=share)
-        tests = MonitorTests.of(learned_scales(given.design, learned=True, model=given.model))
+        watch, numbers = watched(site, share=share), (1, max_attacked)
+        core, few = watch.design.core, watch.known(QUIET)
+        steps = watch.steps(few, (1, SINCE))
+        (jumped,) = watch.steps(few, (SINCE,), jump=max(rivals.jumps(core.modes)))
+        late = watch.known(QUIET + SINCE)
+        spread = np.sqrt(estimate.honest(core.modes, core.estimator, late.filter, late.static).variance)
+
+        def both(steps: tuple[StepTests, ...]) -> tuple[MonitorTests, Mapping[int, Corridor]]:
+            tests = watch.tests(steps)
+            return tests, {count: tests.corridor(count) for count in numbers}
+
         return cls(
             site,
+            watch,
             max_attacked,
-            given,
-            {
-                (seen, count): within(given, count, seen=seen)
-                for seen in (False, True)
-                for count in (1, max_attacked)
-            },
+            risk,
             box(site, share=share, curves=CurvePositions.DEADBAND),
-            _claims(site, given, share),
-            tests,
-            {count: tests.corridor(count) for count in (1, max_attacked)},
+            NamedSizes(core, steps[-1], jumped, risk),
+            {
+                count: noticed(steps[-1], count, risk=risk, error=watch.model[site.meters])
+                for count in numbers
+            },
+            np.stack([each.weights for each in steps]),
+            math.sqrt(2.0 * math.log(2.0 / risk)) * spread + float(watch.model.max()),
+            both(watch.learned),
+            both(watch.initial),
         )
 
 
@@ -182,38 +309,6 @@ def _row(given: _Given, piece: int) -> dict[str, Any]:
     return _meter(given, piece) if piece < p else _customer(given, piece - p)
 
 
-def monitor_rule(site: Site, *, risk: float = RISK, share: float = SHARE) -> Rule:
-    """Rule of the sequential monitor with the settings of the feeder's files.
-
-    Raises NotObservable, DesignInfeasible if the feeder cannot be monitored.
-    """
-    settings = site.tables.meta.monitor
-    found = design_sequential(
-        plant(site),
-        doubt=load_doubt(site),
-        step_s=settings.tick_s,
-        options=SequentialOptions(
-            alarms_per_year=settings.alarms_per_year, commission_s=settings.commission_s
-        ),
-    )
-    p = -share * site.loads.load_peak
-    q = 0.5 * (site.loads.tan_min + site.loads.tan_max) * p
-    model = site.feeder.model_error_bound(p, q, 1.0)[site.meters]
-    if not np.isfinite(model).all():
-        raise DesignInfeasible(
-            f"rule of {site.feeder.name}'s monitor",
-            f"no power flow at {share:g} of the peak",
-            code="not-converged",
-        )
-    return rule(found, risk=risk, model=model)
-
-
-def _claims(site: Site, given: Rule, share: float) -> Floats:
-    """Sizes of false powers in the monitor, as it rounds them up, pu."""
-    least = given.design.options.hidden_power
-    return np.asarray(np.exp2(np.ceil(np.log2(np.maximum(share * site.loads.load_peak, least)))))
-
-
 def _meter(given: _Given, j: int) -> dict[str, Any]:
     site = given.site
     unit = (np.arange(site.meters.size) == j).astype(np.float64)
@@ -229,36 +324,46 @@ def _meter(given: _Given, j: int) -> dict[str, Any]:
         count: largest_lie(given.worst, j, count).bound
         for count in sorted({times * each for times in (1, 2) for _, each in both})
     }
-    for suffix, count in both:
-        hidden = furthest(given.corridors[False, count], unit, must=j)
-        noticed = furthest(given.corridors[True, count], unit, must=j)
-        named = max(named_size(given.rule, j, count, claims=given.claims), noticed.bound)
+    (learned, late), (initial, early) = given.learned, given.initial
+    for suffix, liars in both:
+        unnoticed = furthest(given.unnoticed[liars], unit, must=j).bound
+        first = initial.threshold(early[liars], unit, must=j)
         sizes = {
-            "hidden": hidden.size,
-            "noticed": noticed.bound,
-            "named": named,
-            "fits": fits[count],
-            "identified": fits[2 * count],
-            **_sizes(given.tests.threshold(given.learned[count], unit, must=j)),
+            "hidden": float(hidden_attack(learned, given.watch, j, liars, given.risk)[j]),
+            "noticed": unnoticed,
+            "named": given.named(j, liars, unnoticed),
+            "fits": fits[liars],
+            "identified": fits[2 * liars],
+            **_sizes(learned.threshold(late[liars], unit, must=j)),
+            "undetected_initial": first.undetected,
+            "found_initial": first.found,
         }
-        row |= {f"{name}{suffix}": float(volts_of_lie(base, size)) for name, size in sizes.items()}
+        row |= {f"{name}{suffix}": _volts(base, size) for name, size in sizes.items()}
     return row
 
 
 def _customer(given: _Given, i: int) -> dict[str, Any]:
     site, liars = given.site, given.max_attacked
     bus, base = int(site.feeder.bus[i]), site.customer_volt[i]
-    moved = furthest(given.corridors[True, liars], given.rule.weights(bus)).bound
     # At the busbar the monitor shows the reading of its meter.
     own = float(bus >= site.feeder.busbar_places().stop)
-    learned = given.tests.threshold(given.learned[liars], own * given.tests.region.weights[bus])
+    moved = furthest(given.unnoticed[liars], own * given.weights[:, bus]).bound
+    (learned, late), (initial, early) = given.learned, given.initial
+    sizes = _sizes(learned.threshold(late[liars], own * learned.quiet.weights[bus]))
+    first = initial.threshold(early[liars], own * initial.quiet.weights[bus])
+    sizes |= {"undetected_initial": first.undetected, "found_initial": first.found}
     return {
         "customer": site.feeder.customers[i],
         "bus": site.feeder.buses[bus],
-        "error": float(volts_of_lie(base, moved + given.rule.spread(bus))),
-        "error_fits": float(volts_of_lie(base, worst_error(given.worst, i, liars).bound)),
-        **{f"error_{name}": float(volts_of_lie(base, size)) for name, size in _sizes(learned).items()},
+        "error": _volts(base, moved + given.spread[bus]),
+        "error_fits": _volts(base, worst_error(given.worst, i, liars).bound),
+        **{f"error_{name}": _volts(base, size) for name, size in sizes.items()},
     }
+
+
+def _volts(base: float, size: float) -> float:
+    """A size in volts at nominal voltage; infinite where there is none."""
+    return float(volts_of_lie(base, size)) if math.isfinite(size) else math.inf
 
 
 def _sizes(threshold: Threshold) -> dict[str, float]:

@@ -25,7 +25,7 @@ from gridsec.interface import Frame
 from gridsec.planning.redundancy import from_busbar
 from gridsec.planning.stealthy_attacks import ErrorBox, PowerErrorModel
 
-__all__ = ["SHARE", "Bases", "box", "false_powers", "line_rows", "squared", "volts_of_lie"]
+__all__ = ["SHARE", "Bases", "box", "false_powers", "line_rows", "operating_frame", "squared", "volts_of_lie"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,13 +123,16 @@ def false_powers(
     )
 
 
-def _frame(site: Site, share: float) -> Frame:
-    """Frame of honest meters."""
+def operating_frame(site: Site, share: float) -> Frame:
+    """Frame of honest meters, each load at a share of its peak and each voltage at its base."""
     drawn = np.array([share * row.load_kw for row in site.tables.customers])[site.meters]
-    nominal = site.customer_volt[site.meters]
-    frame = to_frame(
-        site, Snapshot(0.0, nominal, drawn, np.full(drawn.size, np.nan), float(site.feeder.base_volt))
-    )
+    volts, none = site.customer_volt[site.meters], np.full(drawn.size, np.nan)
+    return to_frame(site, Snapshot(0.0, volts, drawn, none, float(site.feeder.base_volt)))
+
+
+def _frame(site: Site, share: float) -> Frame:
+    """The same where customers without a meter have the farthest forecast."""
+    frame = operating_frame(site, share)
     unmetered = np.ones(frame.p.size, dtype=np.bool_)
     unmetered[site.meters] = False
     return always(site.forecast, frame, unmetered)

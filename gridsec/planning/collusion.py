@@ -212,5 +212,6 @@ def _independent(part: Floats) -> Ints:
     for k in range(m):
         chosen[:, k] = np.argmax(np.abs(work[:, :, k]), axis=1)
         pivot = work[every, chosen[:, k]]
-        work -= (work[:, :, k] / pivot[:, [k]])[:, :, None] * pivot[:, None, :]
+        # Columns that are done are not read again.
+        work[:, :, k + 1 :] -= (work[:, :, k] / pivot[:, [k]])[:, :, None] * pivot[:, None, k + 1 :]
     return chosen

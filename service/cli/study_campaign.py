@@ -125,7 +125,7 @@ Promised = Annotated[
     typer.Option(
         "--promised",
         help="Attacks of the sizes that `study detectable` finds, for M = 2, in place of the six kinds, and "
-        "the number of its guarantees that hold; the estimator is sequential if --estimator states no other.",
+        "the number of its guarantees that hold; the estimator is modal if --estimator states no other.",
     ),
 ]
 Liars = Annotated[
@@ -232,7 +232,7 @@ def campaign(
     """Simulate attacks over days of profiles: meters named correctly, missed or named falsely, and delays."""
     from feeders.model.site import load
     from feeders.profiles import Season
-    from feeders.registry import SEQUENTIAL
+    from feeders.registry import MODAL
     from feeders.simulation.trial import TrialMeterErrors
     from feeders.studies.campaign.plan import Design, Place
     from feeders.studies.campaign.study import campaign as study
@@ -266,8 +266,8 @@ def campaign(
                 places=places,
                 design=drawn,
                 seasons=seasons,
-                # A more sensitive estimator names attacks of the sizes that `study detectable` calls hidden.
-                estimator=estimator or (SEQUENTIAL if promised else None),
+                # The sizes of `study detectable` are those of this estimator.
+                estimator=estimator or (MODAL if promised else None),
                 alarms_per_year=tuple(sorted(set(alarms_per_year))) if alarms_per_year else None,
                 learn_s=3600.0 * learned,
                 settings=tuple(settings),
@@ -317,7 +317,7 @@ def _print(found: Campaign, output: Output) -> None:
 def _with_promised(
     site: Site, plan: CampaignPlan, others: tuple[AttackClass, ...], kept: Keeping
 ) -> CampaignPlan:
-    from feeders.studies.campaign.guarantees import promised
+    from feeders.studies.campaign.guarantees import earliest_s, promised
     from feeders.studies.detectable import detectable, workers
 
     stated = plan.trial(site, plan.moment(0)).stated
@@ -325,7 +325,10 @@ def _with_promised(
         found = detectable(
             stated, max_attacked=2, runner=workers(stated, None), journal=kept, progress=report_progress
         )
-    return replace(plan, kinds=(*others, *promised(stated, found)))
+    low, high = plan.onset_s
+    least = earliest_s(stated)
+    onset_s = max(low, least), max(high, least)
+    return replace(plan, kinds=(*others, *promised(stated, found)), onset_s=onset_s)
 
 
 def _short(table: pd.DataFrame) -> pd.DataFrame:

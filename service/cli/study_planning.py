@@ -194,7 +194,7 @@ def detectable(
     out: Out = None,
     plot: Plot = None,
 ) -> None:
-    """Compute the smallest surely identified attacks, the largest hidden ones, and their errors; in V."""
+    """Compute the largest hidden attacks, the smallest found and named ones, and their errors; in V."""
     from feeders.model.site import load
     from feeders.studies.campaign.guarantees import rehearse
     from feeders.studies.detectable import detectable as study
@@ -217,10 +217,10 @@ def detectable(
         places = ["customer", "bus"]
         output = Output("detectable")
         output.table(
-            f"Attacks, V: each meter alone, and with {more} more", found.meters.drop(columns=places).round(2)
+            f"Attacks, V: each meter alone, and with {more} more", found.meters.drop(columns=places).round(3)
         )
         output.table(
-            f"Errors of the voltage with {more + 1} hidden manipulated meters, V", found.customers.round(2)
+            f"Errors of the voltage with {more + 1} hidden manipulated meters, V", found.customers.round(3)
         )
         write_tables(out, "detectable", found.tables)
         if trials:

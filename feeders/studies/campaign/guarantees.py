@@ -1,8 +1,8 @@
 """Test of the sizes that `detectable` guarantees by simulated attacks and in campaigns.
 
 Every trial draws errors of loads, meters and busbar: Gaussian in even trials, uniform with the same standard
-deviations in odd ones. The feeder is solved with its inverters in equilibrium. The monitor processes some
-honest frames and then the attack.
+deviations in odd ones. The feeder is solved with its inverters in equilibrium. The monitor `modal`, without
+learned errors, processes some honest frames and then the attack.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ import pandas as pd
 from feeders.model.site import Site
 from feeders.simulation.attacks import AttackKind
 from feeders.studies.campaign.plan import AttackClass, Promise
-from feeders.studies.detectable import Detectable, monitor_rule
+from feeders.studies.detectable import Detectable, Watched, hidden_attack, watched
 from feeders.studies.operating import SHARE, squared, volts_of_lie
 from feeders.studies.running import Progress, Where, run_pieces
 from gridsec.arrays import Bools, Floats
-from gridsec.estimators import sequential
-from gridsec.estimators.sequential import LoadDoubt
+from gridsec.estimators.modal import monitor
+from gridsec.estimators.sequential.posterior import LoadDoubt
 from gridsec.interface import Frame
-from gridsec.planning.detectability import Rule, largest_shift
+from gridsec.planning.detectability import QUIET
 
-__all__ = ["Rehearsal", "promised", "rehearse"]
+__all__ = ["Rehearsal", "earliest_s", "promised", "rehearse"]
 
 
-_HONEST, _LYING = 4, 16  # frames before and after the onset of an attack
+_LYING = 16  # frames from the onset of an attack on
 _SETTLING = 25  # iterations to the inverters' equilibrium; their loop gain is below one
 
 
@@ -60,8 +60,9 @@ def rehearse(
 ) -> Rehearsal:
     """Simulate the monitor under attacks at the limits found, by M meters and by one.
 
-    Hidden attacks are the worst of their size, from the mixed-integer program. Large ones are on one meter,
-    beyond its size. In every second trial M - 1 other meters are attacked as well, by up to twice their size.
+    Attacks begin when the observer of the inverters has settled, after `QUIET` further honest frames. Hidden
+    attacks are the worst of their size. Large ones are on one meter, beyond its size. In every second trial
+    M - 1 other meters are attacked as well, by up to twice their size.
     `share` is that of `found`. An interrupted run resumes from its journal, also with more trials.
 
     Raises OtherStudy, InUse as `feeders.studies.running.Journal`.
@@ -69,18 +70,20 @@ def rehearse(
     sizes = [float(size) for name in ("hidden", "named", "named_alone") for size in found.meters[name]]
     told = {"max_attacked": found.max_attacked, "risk": found.risk, "sizes": sizes}
     subject = {"study": "trials", "digest": site.digest, "found": told, "seed": seed, "share": share}
-    given = monitor_rule(site, risk=found.risk, share=share)
-    p = site.meters.size
+    given, p = watched(site, share=share), site.meters.size
+    tests = given.tests(given.learned)
 
     @cache
     def worst(j: int) -> Floats:
-        return largest_shift(given, np.eye(p)[j], found.max_attacked, seen=False, must=j).lies
+        return hidden_attack(tests, given, j, found.max_attacked, found.risk)
 
     def trial(k: int) -> list[int]:
         rng = np.random.default_rng([seed, k])
         sign, j = rng.choice([-1.0, 1.0]), int(rng.integers(p))
         caught = _named(given, site, share, rng, sign * rng.uniform(0.5, 1.0) * worst(j)).any()
         lies = _large(site, found, rng, j, together=k % 2 == 0)
+        if not lies.any():
+            return [int(caught), 0, 0]
         named = _named(given, site, share, rng, sign * lies)
         return [int(caught), int(not named[j]), int((named & (lies == 0.0)).any())]
 
@@ -89,10 +92,17 @@ def rehearse(
 
 
 def _large(site: Site, found: Detectable, rng: np.random.Generator, j: int, *, together: bool) -> Floats:
-    """Attack on meter j beyond its named size, and on others in collusion; squared pu."""
+    """Attack on meter j beyond its named size, and on others in collusion; squared pu; 0 without a size.
+
+    Others without a named size are attacked by up to twice the size at which they are noticed.
+    """
     column = "named" if together else "named_alone"
-    sizes = squared(site.customer_volt[site.meters], found.meters[column].to_numpy())
-    lies = np.zeros(sizes.size)
+    volts = found.meters[column].to_numpy()
+    lies = np.zeros(volts.size)
+    if not np.isfinite(volts[j]):
+        return lies
+    volts = np.where(np.isfinite(volts), volts, found.meters["noticed_alone"].to_numpy())
+    sizes = squared(site.customer_volt[site.meters], volts)
     if together and found.max_attacked > 1:
         others = rng.choice(np.delete(np.arange(sizes.size), j), found.max_attacked - 1, replace=False)
         lies[others] = rng.uniform(-2.0, 2.0, others.size) * sizes[others]
@@ -100,23 +110,24 @@ def _large(site: Site, found: Detectable, rng: np.random.Generator, j: int, *, t
     return lies
 
 
-def _named(given: Rule, site: Site, share: float, rng: np.random.Generator, lies: Floats) -> Bools:
+def _named(given: Watched, site: Site, share: float, rng: np.random.Generator, lies: Floats) -> Bools:
     """Mask of the meters named in one trial."""
     design = given.design
     frame = _world(given, site, share, rng)
-    state = sequential.init(design, 0.0)
+    state, onset = monitor.init(design, 0.0), given.settling + QUIET
     named = np.zeros(lies.size, dtype=np.bool_)
-    for tick in range(_HONEST + _LYING):
-        state, _, verdict = sequential.step(
-            design, state, frame(tick, lies if tick >= _HONEST else 0.0 * lies)
-        )
+    for tick in range(onset + _LYING):
+        state, _, verdict = monitor.step(design, state, frame(tick, lies if tick >= onset else 0.0 * lies))
         named |= verdict.suspects
     return named
 
 
-def _world(given: Rule, site: Site, share: float, rng: np.random.Generator) -> Callable[[int, Floats], Frame]:
+def _world(
+    given: Watched, site: Site, share: float, rng: np.random.Generator
+) -> Callable[[int, Floats], Frame]:
     """Frames of a feeder in equilibrium, with fixed errors of true powers, busbar and meters."""
-    design, doubt, loads = given.design, given.design.doubt, site.loads
+    front, loads = given.design.front, site.loads
+    doubt = front.doubt
     accuracy, own = site.accuracy, site.droop.customer
     draw = _uniform if rng.integers(2) else np.random.Generator.standard_normal
     p = -share * loads.load_peak
@@ -128,7 +139,7 @@ def _world(given: Rule, site: Site, share: float, rng: np.random.Generator) -> C
         v2 = site.feeder.bus_voltages(p + off_p, injected, 1.0, steps=3)[site.feeder.bus]
         x = 0.5 * x + 0.5 * site.droop(site.droop.vbar**2 - v2[own])
     v = np.sqrt(v2[site.meters]) * (1.0 + accuracy.class_fraction * rng.uniform(-1.0, 1.0, site.meters.size))
-    busbar = (1.0 + design.busbar / 2.0 * draw(rng, site.feeder.busbar_places().stop)) ** 2
+    busbar = (1.0 + front.busbar / 2.0 * draw(rng, site.feeder.busbar_places().stop)) ** 2
     root3 = np.sqrt(3.0)
 
     def frame(tick: int, lies: Floats) -> Frame:
@@ -136,7 +147,7 @@ def _world(given: Rule, site: Site, share: float, rng: np.random.Generator) -> C
         step = np.maximum(accuracy.resolution, 1e-9)
         reading = np.round(reading / step) * step
         return Frame(
-            t=(tick + 1) * design.step_s,
+            t=(tick + 1) * front.step_s,
             y=reading**2 + lies,
             seen=np.ones(v.size, dtype=np.bool_),
             v0_squared=float(busbar.mean()),
@@ -178,7 +189,7 @@ def promised(site: Site, found: Detectable, *, share: float = SHARE) -> tuple[At
     """Attacks of the sizes of `detectable`, for a campaign.
 
     The feeder has the campaign's errors of loads and meters. For M = 1 there are only attacks on one meter.
-    Kinds without an attack of guaranteed outcome are left out.
+    Kinds without an attack of guaranteed outcome are left out, and kinds where a meter has no size.
 
     Returns hidden_alone, hidden: one meter, and M meters in the worst collusion of this size; no device is to
         be named.
@@ -199,7 +210,18 @@ def promised(site: Site, found: Detectable, *, share: float = SHARE) -> tuple[At
             AttackClass("hidden", AttackKind.BIAS, HIDDEN, (), worst, (most,), Promise.HIDDEN),
             AttackClass("named", AttackKind.BIAS, NAMED, _volts(found, "named"), (), (most,), Promise.NAMED),
         ]
-    return tuple(kind for kind in kinds if any(kind.volts) or kind.together)
+    return tuple(
+        kind for kind in kinds if (any(kind.volts) or kind.together) and np.isfinite(kind.volts).all()
+    )
+
+
+def earliest_s(site: Site, *, share: float = SHARE) -> float:
+    """Time after the start of the monitor from which on attacks are those of the study, s.
+
+    The observer of the inverters has settled, and `QUIET` further readings are honest.
+    """
+    given = watched(site, share=share)
+    return (given.settling + QUIET) * given.step_s
 
 
 def _volts(found: Detectable, column: str) -> tuple[float, ...]:
@@ -208,8 +230,9 @@ def _volts(found: Detectable, column: str) -> tuple[float, ...]:
 
 def _collusions(site: Site, found: Detectable, share: float) -> tuple[tuple[float, ...], ...]:
     """Attacks on all meters, V: for each meter the worst hidden one with this meter in it."""
-    rule, p = monitor_rule(site, risk=found.risk, share=share), site.meters.size
-    worst = [largest_shift(rule, np.eye(p)[j], found.max_attacked, seen=False, must=j).lies for j in range(p)]
+    given, p = watched(site, share=share), site.meters.size
+    tests = given.tests(given.learned)
+    worst = [hidden_attack(tests, given, j, found.max_attacked, found.risk) for j in range(p)]
     base = site.customer_volt[site.meters]
     volts = [np.sign(lies) * volts_of_lie(base, np.abs(lies)) for lies in worst]
     volts = [np.where(np.abs(row) > NOTHING, row, 0.0) for row in volts]

@@ -150,6 +150,18 @@ def rivals(modes: Modes) -> tuple[Modes, ...]:
     return tuple(replace(modes, varying=scale * modes.varying) for scale in UNREST)
 
 
+def jumps(modes: Modes) -> tuple[float, ...]:
+    """Variances of a jump of the loads, in those of the loads, 1.
+
+    Parameters
+    ----------
+    modes
+        The modes, with the correlation time.
+    """
+    scale = min(1.0, WITHIN_S / min(modes.model.time_s, REPORTED_S))
+    return tuple(scale * each for each in JUMPS)
+
+
 def first(modes: Modes, others: Sequence[Modes], history: History) -> list[Rival]:
     """The model itself, without jumps, and all rivals, before the first kept reading and without an onset.
 
@@ -316,9 +328,8 @@ def _jump(  # noqa: PLR0917  # the states of both parts, and one tick
 ) -> tuple[float, float]:
     """The likeliest jump of a tick, in the variances of the loads, and the logarithm of its prior."""
     rho, rho_b = gap.decay(modes)
-    scale = min(1.0, WITHIN_S / min(modes.model.time_s, REPORTED_S))
     sizes, priors = (
-        (0.0, *(scale * each for each in JUMPS)),
+        (0.0, *jumps(modes)),
         [log(1.0 - len(JUMPS) * RATE), *[log(RATE)] * len(JUMPS)],
     )
     if state.full is None:

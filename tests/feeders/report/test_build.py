@@ -130,8 +130,8 @@ def shown(text: str) -> tuple[float, float]:
     return float(digits), 10.0 ** -len(digits.partition(".")[2])
 
 
-ABOVE = ("noticed", "named", "error", "error_fits", "high_volt", "before", "after")
-BELOW = ("hidden", "margin", "low_volt", "capacity_kw")
+ABOVE = ("noticed", "named", "found", "error", "error_fits", "high_volt", "before", "after")
+BELOW = ("hidden", "undetected", "margin", "low_volt", "capacity_kw")
 
 
 def test_every_number_of_a_sentence_is_that_of_its_table(made: Report) -> None:

@@ -139,6 +139,7 @@ def test_sizes_on_two_levels_are_drawn_in_parts_of_the_nominal_voltage() -> None
     volt = percent / 100.0 * two.customer_nominal
     meters = pd.DataFrame({"meter": names, "customer": names, "bus": names})
     meters = meters.assign(hidden=0.1 * volt, noticed=volt, named=2.0 * volt)
+    meters = meters.assign(undetected=0.2 * volt, found=0.4 * volt)
     customers = pd.DataFrame({"customer": names, "bus": names, "error": volt, "error_fits": volt})
     section = sizes(two, Detectable("two", "", 1, 1e-3, meters, customers))
     by_name = {figure.name: figure for figure in section.figures}

@@ -13,24 +13,27 @@ import pytest
 from benchmarks._scenes import Model, Setting, play, watcher
 from feeders.model.site import Site, load
 from feeders.simulation.scenario import START
+from feeders.studies import detectable as study
 from feeders.studies.campaign.guarantees import Rehearsal, rehearse
-from feeders.studies.detectable import Detectable, detectable, monitor_rule, workers
+from feeders.studies.detectable import Detectable, detectable, workers
 from feeders.studies.operating import volts_of_lie
 from feeders.studies.running import Here, Processes
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import InputInvalid
-from gridsec.estimators import sequential
-from gridsec.estimators.sequential.meter_bias import Learned
+from gridsec.estimators.sequential.meter_bias import Commission
 from gridsec.interface import Decision
-from gridsec.planning.detectability import ROOM, MonitorTests, learned_scales
+from gridsec.planning.detectability import HONEST, INITIAL, ROOM, MonitorTests
 from tests.codes import refused
 from tests.feeders.studies.rural import RURAL, rural_sizes
 
 CIGRE = load("cigre-lv")
 DAY_S, LEARN_STEP_S = 86_400.0, 300.0
-CALM, LIE = 20, 80
+LIE = 1024
+"""Seconds of a lie: the last age of the study."""
+HELD = 60
+"""Seconds for which a lie that is found is not CLEAN."""
 TIMES = (1.0 + ROOM) / (1.0 - ROOM)
-"""1.5: from undetected to found."""
+"""2.3: from undetected to found."""
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +49,11 @@ def test_sizes_are_in_order(cigre: Detectable) -> None:
         assert (table[f"hidden{suffix}"] < table[f"noticed{suffix}"]).all()
         assert (table[f"noticed{suffix}"] <= table[f"named{suffix}"]).all()
         assert (table[f"fits{suffix}"] <= table[f"identified{suffix}"] + 1e-6).all()
-    for name in ("hidden", "noticed", "named", "fits", "identified"):
+        assert (table[f"hidden{suffix}"] < table[f"undetected{suffix}"]).all()
+        assert (table[f"undetected{suffix}"] < table[f"found{suffix}"]).all()
+        assert (table[f"undetected_initial{suffix}"] < table[f"found_initial{suffix}"]).all()
+        assert (table[f"found{suffix}"] < table[f"noticed{suffix}"]).all()
+    for name in ("hidden", "noticed", "named", "fits", "identified", "undetected", "found", "found_initial"):
         assert (table[f"{name}_alone"] <= table[name] * (1 + 1e-4)).all()
     assert (cigre.customers[["error", "error_fits"]] > 0.0).all(axis=None)
 
@@ -114,44 +121,50 @@ def test_arguments_are_checked() -> None:
 
 
 @cache
-def promise(feeder: str) -> tuple[Site, Detectable, MonitorTests]:
-    """Feeder, sizes for at most two meters, and the tests of the learned monitor."""
+def promise(feeder: str) -> tuple[Site, Detectable, MonitorTests, MonitorTests]:
+    """Feeder, sizes for two meters, and the tests with learned errors and from the first reading on."""
     site = load(feeder)
-    given = monitor_rule(site)
-    tests = MonitorTests.of(learned_scales(given.design, learned=True, model=given.model))
-    return site, detectable(site, max_attacked=2), tests
+    given = study.watched(site)
+    return site, detectable(site, max_attacked=2), given.tests(given.learned), given.tests(given.initial)
 
 
-def learned_day(setting: Setting) -> Learned:
+def learned_day(setting: Setting) -> Commission:
     """Fixed errors learned over an honest day of AC power flow."""
-    made = watcher(setting.feeder, setting.model, step_s=LEARN_STEP_S, commission_s=DAY_S).design
-    begin = START - DAY_S - 2.0 * LEARN_STEP_S
-    state = sequential.init(made, begin)
+    made = watcher(setting.feeder, setting.model, step_s=LEARN_STEP_S, commission_s=DAY_S, estimator="modal")
+    begin, by = START - DAY_S - 2.0 * LEARN_STEP_S, made.family.bias_learning
+    assert by is not None
+    state = made.init(begin)
     for frame, _ in play(setting, START - begin, step_s=LEARN_STEP_S, start=begin):
-        state, _, _ = sequential.step(made, state, frame)
-    assert state.learning is None
-    return state.learned
+        state, _, _ = made.step(state, frame)
+    known: Commission = by.commission(state)
+    assert known.learning is None
+    return known
 
 
-def watched(setting: Setting, known: Learned, lies: Floats) -> tuple[Bools, Floats]:
+def watched(
+    setting: Setting, known: Commission | None, lies: Floats, *, calm: int = HONEST, lying: int = LIE
+) -> tuple[Bools, Floats]:
     """CLEAN ticks of a lie (p,), squared pu, that begins after honest seconds, and the last estimate."""
-    made = watcher(setting.feeder, setting.model).design
-    state, clean = sequential.init(made, START, known), []
-    for k, (frame, _) in enumerate(play(setting, float(CALM + LIE))):
-        seen = replace(frame, y=frame.y + lies) if k >= CALM else frame
-        state, estimate, verdict = sequential.step(made, state, seen)
+    made = watcher(setting.feeder, setting.model, estimator="modal")
+    by = made.family.bias_learning
+    assert by is not None
+    state = by.init(made.design, START, known) if known else made.init(START)
+    clean = []
+    for k, (frame, _) in enumerate(play(setting, float(calm + lying))):
+        seen = replace(frame, y=frame.y + lies) if k >= calm else frame
+        state, estimate, verdict = made.step(state, seen)
         clean.append(verdict.decision is Decision.CLEAN)
-    return np.array(clean[CALM:]), estimate.v2
+    return np.array(clean[calm:]), estimate.v2
 
 
 @pytest.mark.canary("cigre-lv-0")
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("feeder", ["cigre-lv", "simbench-lv-rural1", "kerber-landnetz"])
-def test_what_the_study_calls_undetected_is_clean_and_one_and_a_half_times_it_is_found(
+def test_what_the_study_calls_undetected_is_clean_and_above_twice_as_much_is_found(
     feeder: str, seed: int
 ) -> None:
     """AC power flow as truth, fixed errors learned; alone and in the worst pair, both signs."""
-    site, given, tests = promise(feeder)
+    site, given, tests, _ = promise(feeder)
     p, base = site.meters.size, site.customer_volt[site.meters]
     setting = Setting(feeder, Model.MATCHED, learned=True, seed=seed)
     known, rng = learned_day(setting), np.random.default_rng(seed)
@@ -164,23 +177,51 @@ def test_what_the_study_calls_undetected_is_clean_and_one_and_a_half_times_it_is
         clean, _ = watched(setting, known, sign * lies)
         assert clean.all()
         clean, _ = watched(setting, known, sign * TIMES * lies)
+        # A named meter is released when it agrees, and such a small lie may.
+        first = int(np.argmin(clean))
+        assert clean.size - first >= HELD
+        assert not clean[first : first + HELD].any()
+
+
+@pytest.mark.canary("cigre-lv-0")
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("feeder", ["cigre-lv", "simbench-lv-rural1", "kerber-landnetz"])
+def test_a_lie_from_the_first_reading_on_is_clean_up_to_its_size_and_found_beyond(
+    feeder: str, seed: int
+) -> None:
+    """As above, with fixed errors known by their class only. The inverters settle in the first seconds."""
+    site, given, _, tests = promise(feeder)
+    p, base, ticks = site.meters.size, site.customer_volt[site.meters], 2 * INITIAL[0]
+    setting, rng = Setting(feeder, Model.MATCHED, learned=False, seed=seed), np.random.default_rng(seed)
+    settled = study.watched(site).settling
+    for count, suffix in ((1, "_alone"), (2, "")):
+        j, sign = int(rng.integers(p)), rng.choice([-1.0, 1.0])
+        told = tests.threshold(tests.corridor(count), np.eye(p)[j], must=j)
+        assert volts_of_lie(base[j], told.lies[j]) == pytest.approx(
+            given.meters.loc[j, f"undetected_initial{suffix}"], rel=1e-6
+        )
+        clean, _ = watched(setting, None, sign * told.lies, calm=0, lying=ticks)
+        assert clean[settled:].all()
+        larger = sign * told.lies * told.found / told.undetected
+        clean, _ = watched(setting, None, larger, calm=0, lying=ticks)
         assert not clean[-10:].any()
 
 
 @pytest.mark.acceptance
 def test_the_error_of_an_undetected_pair_is_the_one_promised(cigre: Detectable) -> None:
     setting = Setting("cigre-lv", Model.MATCHED, learned=True, seed=1)
-    known, (_, _, tests) = learned_day(setting), promise("cigre-lv")
+    known, (_, _, tests, _) = learned_day(setting), promise("cigre-lv")
     row = cigre.customers["error_undetected"]
     i = int(row.argmax())
-    lies = tests.threshold(tests.corridor(2), tests.region.weights[CIGRE.feeder.bus[i]]).lies
+    lies = tests.threshold(tests.corridor(2), tests.quiet.weights[CIGRE.feeder.bus[i]]).lies
     clean, attacked = watched(setting, known, lies)
     assert clean.all()
     _, honest = watched(setting, known, 0.0 * lies)
-    moved = abs(np.sqrt(attacked[i]) - np.sqrt(honest[i])) * CIGRE.customer_volt[i]
+    moved = float(volts_of_lie(CIGRE.customer_volt[i], abs(attacked[i] - honest[i])))
     assert moved == pytest.approx(row[i], rel=0.05)
     assert cigre.customers["error_unavoidable"][i] < cigre.customers["error_found"][i]
     assert row[0] == 0.0  # at the busbar
     # Between undetected and found is the limit itself.
     limit = cigre.meters["found_alone"] / (1.0 + ROOM)
-    assert (limit < 1.5 * cigre.meters["unavoidable_alone"]).all()
+    # The minimum knows meter and onset, and looks once in the time of the last age.
+    assert (limit < 2.0 * cigre.meters["unavoidable_alone"]).all()

@@ -62,8 +62,11 @@ def test_numbers_of_detectable() -> None:
             sizes = [f"{meters.loc[meter, name + suffix]:.2f}" for name in names]
             assert cells(f"{meter}, {who}") == sizes
             learned = ("undetected", "found", "unavoidable")
-            sizes = [f"{meters.loc[meter, name + suffix]:.2f}" for name in learned]
+            sizes = [f"{meters.loc[meter, name + suffix]:.3f}" for name in learned]
             assert cells(f"{meter}, {who}, learned") == sizes
+            initial = ("undetected_initial", "found_initial")
+            sizes = [f"{meters.loc[meter, name + suffix]:.2f}" for name in initial]
+            assert cells(f"{meter}, {who}, initial") == sizes
     customers = found.customers.set_index("customer")
     for name in ("LV1.101 Load 13", "LV1.101 Load 2"):
         errors = [f"{customers.loc[name, column]:.2f}" for column in ("error", "error_fits")]

@@ -53,7 +53,7 @@ def test_promises_are_played_and_counted(
     code, told, _ = run(monkeypatch, capsys, *words)
     assert code == 0
     assert "Guarantees of `study detectable`" in told
-    assert "monitored by sequential (--promised)" in told
+    assert "monitored by modal (--promised)" in told
     kept = pd.read_csv(tmp_path / "out" / "campaign-promises.csv").set_index("promise")
     assert kept["lies"].to_dict() == {"hidden": 4, "named": 4}
     assert kept["broken"].sum() == 0

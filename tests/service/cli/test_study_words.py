@@ -102,7 +102,8 @@ def test_detectable(given: Given) -> None:
     meters, customers = ran.table("meters"), ran.table("customers")
     for pattern, table, column in (
         (r"noticed from ([\d.]+) V", meters, "noticed"),
-        (r"is left from ([\d.]+) V", meters, "named"),
+        (r"meter named from ([\d.]+) V", meters, "named"),
+        (r"found from ([\d.]+) V", meters, "found"),
         (r"by at most ([\d.]+) V", customers, "error"),
     ):
         largest = table[column].max()
