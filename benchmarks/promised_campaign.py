@@ -2,8 +2,8 @@
 
     python -m benchmarks.promised_campaign [lies] [--feeder NAME] [--journal FILE]
 
-So many lies that are to stay hidden, of two meters in the worst collusion or of one alone, and as many
-whose liars are to be named: 10 000 of each by default, on all cores. A scene has three scenarios of 26 s; the
+Lies that are to stay hidden, of two meters in the worst collusion or of one alone, and lies that are to be
+named: 10 000 of each by default, on all cores. A scene has three scenarios of 26 s; the
 first is without a lie, and the others, 12 s of a lie each, are compared with it. Exits 1 if a meter is named
 because of one of the former, or one of the latter is missed. With a journal an interrupted run goes on. The
 feeder is SimBench rural 1, 13 customers, unless another is asked for.

@@ -232,7 +232,7 @@ def _unknown(made: ModalDesign, frame: Frame, step_s: float) -> Iterator[Floats 
     state = monitor.init(made, 0.0)
     for k in count():
         state, _, _ = monitor.step(made, state, replace(frame, t=k * step_s))
-        yield state.core.history.readings[-1][3]
+        yield state.core.history.unknown
 
 
 def _directions(unknown: Floats | None) -> int:

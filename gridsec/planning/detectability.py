@@ -507,7 +507,7 @@ class MonitorTests:
             return Threshold(0.0, linear.bound, 0.0, lies)
         hidden = ConeProgram(*self._among(meters))(along[meters])
         lies[meters] = hidden.amounts
-        F = self.information[np.ix_(meters, meters)]
+        F = submatrix(self.information, meters, meters)
         least = self.z * sqrt(float(along[meters] @ np.linalg.solve(F, along[meters])))
         return Threshold(hidden.size, linear.bound, least, lies)
 
