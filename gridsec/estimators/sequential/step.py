@@ -571,10 +571,19 @@ def injection_target(
 ) -> Floats:
     """Largest errors of the set-points between two frames, (m,), pu.
 
+    Between the frames the input of the observer is in the range [a, b] of both inputs, and the true one at
+    most the larger ``width`` W off this range. The curve is monotone, and with ``z = vbar^2 - v^2``
+
+        max(K(z(a - W)) - K(z(b)), K(z(a)) - K(z(b + W))) + mismatch
+
+    bounds the error: on a flat part of the curve the inputs do not matter.
+
     given, width: (m,) squared voltage at each input and its largest error, squared pu.
     """
-    wider, hold = np.maximum(width, before.width), np.abs(given - before.input)
-    return np.asarray(np.minimum(before.span, design.plant.droop.slope * (wider + hold) + design.mismatch))
+    droop, wider = design.plant.droop, np.maximum(width, before.width)
+    low, high = np.minimum(given, before.input), np.maximum(given, before.input)
+    above, top, bottom, below = droop(droop.vbar**2 - np.stack([low - wider, low, high, high + wider]))
+    return np.asarray(np.minimum(before.span, np.maximum(above - bottom, top - below) + design.mismatch))
 
 
 def relaxed(  # noqa: PLR0917
