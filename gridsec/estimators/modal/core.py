@@ -5,6 +5,7 @@
     step(core, state, t, m, seen) -> (CoreState, Evidence)      every tick, releases masked meters
     identify(core, state, evidence) -> Suspicion                where `alarmed`
     transition(core, state, suspicion) -> CoreState             where the misfit is not settled
+    passed(core, state, suspicion) -> (CoreState, Evidence)     where a transition leaves nothing, or None
     outlasts(core, state, suspicion) -> bool                    where one reading is all there is
     mask(core, state, suspicion) -> (CoreState, Evidence)       where meters are named
     adopt(core, state, suspicion) -> CoreState                  where loads alone explain the readings
@@ -83,6 +84,8 @@ Three ticks in turn have it. With kettles in 57 households, and no report of any
 """
 ADOPTED = 0.05
 """Largest weight of sets that need a meter where loads are adopted, 1: a meter may hide its own load."""
+PASSED = 16
+"""Ticks after a transition from which on its readings may be given up, 1."""
 TRIALS = 4
 """Trials of a transition while the age of an onset doubles, about, 1: the replay takes a second or so."""
 RECALLED = 24
@@ -349,7 +352,9 @@ def step(  # noqa: PLR0917  # the state, and one tick
     if evidence.log_m >= core.limit and (not pinned or _elsewhere(evidence, pinned)):
         test = detector.pin(test, evidence.rows)
         last = replay.record(state.history, (after, known, test, ()), m, seen, unknown, jump)
-        others = rivals.replayed(made, core.rivals, last, test.onsets, int(evidence.rows[0]))
+        # An onset in place of a suspected one has to explain the misfit since that.
+        since = others[0].ticks if pinned and others else 0
+        others = rivals.replayed(made, core.rivals, last, test.onsets, int(evidence.rows[0]), since)
         if update.exact is not None:
             rows = np.flatnonzero(test.pinned).tolist()
             suspected = replay.replayed(made, last, test.onsets, rows)
@@ -625,10 +630,10 @@ def _aligned(core: Core, found: Identification) -> bool:
 
 
 def transition(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
-    """Add a rival with a transition since the onset, where the misfit is not settled and it is the likeliest.
+    """Add a rival with a transition, where the misfit is not settled and it is the likeliest.
 
-    An earlier one is replaced. The state is unchanged where another model is likelier. Older onsets are tried
-    at about every fifth part of their age.
+    The transition begins with the earliest suspected onset. It replaces an earlier one. The state is the same
+    where another model is likelier. Older onsets are tried at about every fifth part of their age.
 
     Parameters
     ----------
@@ -637,18 +642,52 @@ def transition(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
     suspicion
         The explanations after the same tick.
     """
-    age = int(state.detector.onsets.age[suspicion.row])
+    age = _since(state)
     if suspicion.settled or not state.rivals or age % max(1, age // TRIALS):
         return state
 
     def cost_of(rival: Rival) -> float:
         return _misfit(core, rival.joint()) - 2.0 * rival.evidence
 
-    found = rivals.transitions(core.modes, state.history, state.detector.onsets, suspicion.row)
+    ramp = bool(state.detector.onsets.ramp[suspicion.row])
+    found = rivals.transitions(core.modes, state.history, age, ramp=ramp)
     best = min((*state.rivals, *found), key=cost_of)
     if not any(best is each for each in found):
         return state
     return replace(state, rivals=(*(each for each in state.rivals if not each.transition), best))
+
+
+def passed(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState, Evidence] | None:
+    """State without the readings of a transition that has ended; None where it leaves an explanation to find.
+
+    The likeliest model has a transition, and may need no fault beside it. The kept readings are replayed with
+    those of the transition unknown. Nothing is left where log M then is below `CALM` of the limit.
+
+    Parameters
+    ----------
+    core, state
+        The core, and the state after a tick.
+    suspicion
+        The explanations after the same tick.
+    """
+    age, found, readings = _since(state), suspicion.found, state.history.readings
+    if not state.rivals or age > len(readings):
+        return None
+    model = int(found.model[0])
+    length = state.rivals[model].transition
+    without = found.weight[(found.model == model) & ~found.chosen.any(axis=1)].sum()
+    if not length or age - length < PASSED or without < DOUBT:
+        return None
+    first, apart = len(readings) - age, rivals.APART * np.eye(core.modes.size)
+
+    def apart_at(k: int, seen: Bools | None, unknown: Floats | None) -> tuple[Bools | None, Floats | None]:
+        inside = first <= k < first + length
+        return seen, (apart if unknown is None else np.hstack([unknown, apart])) if inside else unknown
+
+    now, evidence = again(core, state, first, apart_at)
+    if now.detector.log_m >= CALM * core.limit:
+        return None
+    return replace(now, masked=state.masked), evidence
 
 
 def outlasts(core: Core, state: CoreState, suspicion: Suspicion) -> bool:
@@ -673,6 +712,11 @@ def outlasts(core: Core, state: CoreState, suspicion: Suspicion) -> bool:
         return False
     again = identify(core, after, evidence, suspicion)
     return bool((again.found.named >= suspicion.found.named).all())
+
+
+def _since(state: CoreState) -> int:
+    """Kept readings since the earliest suspected onset."""
+    return state.rivals[0].ticks if state.rivals else 0
 
 
 def _keeping(found: Identification) -> Bools:

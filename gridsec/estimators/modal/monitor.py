@@ -362,14 +362,18 @@ def _identified(
         return _unsuspected(state), evidence
     if tick < state.due or not core.alarmed(kernel, evidence):
         return replace(state, suspicion=suspicion), evidence
-    masked = state.core.masked.meters
-    suspicion = core.identify(kernel, state.core, evidence, suspicion)
-    with_transition = core.transition(kernel, state.core, suspicion)
-    if with_transition is not state.core:
-        beside = core.identify(kernel, with_transition, evidence, suspicion)
-        # A transition takes the evidence of a single false reading away.
-        if beside.settled or not suspicion.fits:
-            state, suspicion = replace(state, core=with_transition), beside
+    now, suspicion = _searched(kernel, state.core, evidence, suspicion)
+    over = core.passed(kernel, now, suspicion)
+    if over is not None:
+        return _unsuspected(replace(state, core=over[0])), over[1]
+    return _named(design, replace(state, core=now, suspicion=suspicion), suspicion, evidence, uses_q)
+
+
+def _named(
+    design: ModalDesign, state: ModalState, suspicion: Suspicion, evidence: Evidence, uses_q: Bools
+) -> tuple[ModalState, Evidence]:
+    """State after a search with explanations, with the confirmed meters masked."""
+    kernel, tick, masked = design.core, state.front.ticks, state.core.masked.meters
     named = suspicion.found.named & ~masked
     streak = np.where(suspicion.found.chosen[0, : named.size], state.streak + 1, 0)
     certain = verdict.certain_phases(kernel, suspicion) & suspicion.fits
@@ -380,9 +384,7 @@ def _identified(
     # A fault with a first naming is searched again at the next tick.
     first = any((each == 1).any() for each in (streak[named], phases, inverters))
     wait = 1 if first else max(1, age // LOOKS)
-    after = replace(
-        state, suspicion=suspicion, streak=streak, phases=phases, inverters=inverters, due=tick + wait
-    )
+    after = replace(state, streak=streak, phases=phases, inverters=inverters, due=tick + wait)
     since = () if any_of(masked) else state.core.history.readings[-age:]
     sure = final(suspicion.found, named, streak, since, kernel.near.laterals)
     sole = age == 1 and any_of(named) and np.count_nonzero(suspicion.found.chosen[0]) == 1
@@ -404,6 +406,20 @@ def _identified(
         if adopted is not state.core:
             return replace(after, core=adopted, suspicion=None), evidence
     return after, evidence
+
+
+def _searched(
+    kernel: Core, state: CoreState, evidence: Evidence, before: Suspicion | None
+) -> tuple[CoreState, Suspicion]:
+    """Explanations, with a transition as a rival where that settles the misfit."""
+    suspicion = core.identify(kernel, state, evidence, before)
+    with_transition = core.transition(kernel, state, suspicion)
+    if with_transition is not state:
+        beside = core.identify(kernel, with_transition, evidence, suspicion)
+        # A transition takes the evidence of a single false reading away.
+        if beside.settled or not suspicion.fits:
+            return with_transition, beside
+    return state, suspicion
 
 
 def _unsuspected(state: ModalState) -> ModalState:

@@ -88,8 +88,8 @@ class Rival:
     unsteady
         Share of the last ticks with a jump, 1: a mean with the memory of `RECENT` ticks.
     misfit, count, ticks
-        Squares of the whitened innovations since the onset, less their number; that number, and their ticks.
-        Those before the kept readings do not count.
+        Squares of the whitened innovations since the earliest suspected onset, less their number; that
+        number, and the ticks since then. Those before the kept readings do not count.
     update
         The filter's last step.
     loads
@@ -180,8 +180,8 @@ def first(modes: Modes, others: Sequence[Modes], history: History) -> list[Rival
     ]
 
 
-def replayed(
-    modes: Modes, others: Sequence[Modes], history: History, onsets: Onsets, row: int
+def replayed(  # noqa: PLR0917  # the readings, and two onsets
+    modes: Modes, others: Sequence[Modes], history: History, onsets: Onsets, row: int, since: int = 0
 ) -> tuple[Rival, ...]:
     """The model itself, without jumps, and all rivals, after the last reading.
 
@@ -193,6 +193,8 @@ def replayed(
         The readings.
     onsets, row
         The onsets of the detector after the last reading, and the row of the onset.
+    since
+        Age of an earlier suspected onset, ticks: a misfit that precedes the onset is not explained by it.
     """
     state, _, test, suspected = history.start
     count, age, had = len(history.readings), int(onsets.age[row]), detector.followed(modes, test).onsets
@@ -204,25 +206,30 @@ def replayed(
         begin, one = -1, signatures.single(had, row)
     out = [replace(each, onsets=one, suspected=exactly) for each in first(modes, others, history)]
     for k, (t, m, seen, unknown, jump) in enumerate(history.readings):
-        out = [follow(each, t, m, seen, unknown, jump, begun=k == begin) for each in out]
+        out = [
+            follow(each, t, m, seen, unknown, jump, begun=k == begin, counted=k == count - max(age, since))
+            for each in out
+        ]
     return tuple(out)
 
 
-def transitions(modes: Modes, history: History, onsets: Onsets, row: int) -> tuple[Rival, ...]:
-    """The model itself with transitions of 1, 2, 4, ... ticks, shorter than the onset's age.
+def transitions(modes: Modes, history: History, age: int, *, ramp: bool = False) -> tuple[Rival, ...]:
+    """The model itself with transitions of 1, 2, 4, ... ticks, shorter than the age of an onset.
 
     The misfit begins with the transition's end. None for an onset before the kept readings.
 
     Parameters
     ----------
-    modes, history, onsets, row
+    modes, history
         As in `replayed`.
+    age, ramp
+        Ticks since the onset, its own included, and its shape.
     """
-    age, count, out = int(onsets.age[row]), len(history.readings), list[Rival]()
+    count, out = len(history.readings), list[Rival]()
     if age > count:
         return ()
     (within,) = first(modes, (), history)
-    one = signatures.empty(modes, int(not onsets.ramp[row]), int(onsets.ramp[row]))
+    one = signatures.empty(modes, int(not ramp), int(ramp))
     within, apart = replace(within, onsets=one), APART * np.eye(modes.size)
     for k, (t, m, seen, unknown, jump) in enumerate(history.readings, age - count):
         out = [follow(each, t, m, seen, unknown, jump) for each in out]
@@ -230,7 +237,7 @@ def transitions(modes: Modes, history: History, onsets: Onsets, row: int) -> tup
             within = follow(within, t, m, seen, unknown, jump)
         elif k < age - 1:
             wide = apart if unknown is None else np.hstack([unknown, apart])
-            within = follow(within, t, m, seen, wide, jump, begun=k == 0)
+            within = follow(within, t, m, seen, wide, jump, begun=k == 0, counted=k == 0)
             if (k + 1) & k == 0:
                 out.append(replace(within, transition=k + 1, misfit=0.0, count=0))
     return tuple(out)
@@ -245,6 +252,7 @@ def follow(  # noqa: PLR0917  # the state, and one tick
     jump: float = 0.0,
     *,
     begun: bool = False,
+    counted: bool = False,
 ) -> Rival:
     """Take in the residuals of one tick.
 
@@ -260,8 +268,8 @@ def follow(  # noqa: PLR0917  # the state, and one tick
         Unknown directions, as in `gridsec.estimators.modal.full.step`.
     jump
         As in `gridsec.estimators.modal.filter.Interval`.
-    begun
-        The onset is at this tick.
+    begun, counted
+        The onset is at this tick, and the misfit begins with it.
     """
     modes, state, known, gap = before.modes, before.filter, before.static, Interval(t - before.filter.t, jump)
     total, onsets, suspected, jumps = before.sum, before.onsets, before.suspected, before.jumps
@@ -300,9 +308,9 @@ def follow(  # noqa: PLR0917  # the state, and one tick
         suspected=suspected,
         jumps=jumps,
         unsteady=before.unsteady + (float(size > 0.0) - before.unsteady) / RECENT,
-        misfit=known.square - count + (0.0 if begun else before.misfit),
-        count=count + (0 if begun else before.count),
-        ticks=1 + (0 if begun else before.ticks),
+        misfit=known.square - count + (0.0 if counted else before.misfit),
+        count=count + (0 if counted else before.count),
+        ticks=1 + (0 if counted else before.ticks),
         update=update,
         loads=loads,
     )

@@ -102,7 +102,7 @@ class SequentialOptions:
     unread_std_percent: float = 0.5
     widest: float = 0.1
     v2_limits: tuple[float, float] = (0.25, 2.25)
-    settled: float = 0.1
+    settled: float = 0.05
 
     def __post_init__(self) -> None:
         positive, zero = (

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks._residuals import Dense, Source, power_columns, tree
-from gridsec.estimators.modal import core, detector, rivals, signatures
+from gridsec.arrays import Floats
+from gridsec.estimators.modal import core, detector, full, rivals, signatures
+from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.rivals import RATE, UNREST
 from tests.gridsec.estimators.modal.test_core import LIAR, MODEL
 from tests.gridsec.estimators.modal.test_detector import busbar
@@ -81,9 +83,7 @@ def test_transitions_equal_the_dense_filter(missing: bool) -> None:
     readings, state = Source(MODEL, np.random.default_rng(5)).ticks(ticks), core.init(kernel, 0.0)
     for k, m in enumerate(readings):
         state, _ = core.step(kernel, state, float(k), m, seen)
-    onsets = detector.followed(kernel.modes, state.detector).onsets
-    row = int(np.flatnonzero((onsets.age == age) & ~onsets.ramp & onsets.used)[0])
-    found = rivals.transitions(kernel.modes, state.history, onsets, row)
+    found = rivals.transitions(kernel.modes, state.history, age)
     assert [each.transition for each in found] == [1, 2, 4]
     for mine in found:
         dense, without, exact = Dense(MODEL, np.eye(p), 1.0), Dense(MODEL), 0.0
@@ -103,7 +103,7 @@ def test_transitions_equal_the_dense_filter(missing: bool) -> None:
         inverse = np.linalg.inv(dense.cov[3 * p :, 3 * p :])
         assert np.allclose(inverse, np.eye(p) + information, rtol=1e-5, atol=1e-3)
     # An onset before the kept readings has none.
-    assert not rivals.transitions(kernel.modes, core.init(kernel, 0.0).history, onsets, row)
+    assert not rivals.transitions(kernel.modes, core.init(kernel, 0.0).history, age)
 
 
 def test_manipulations_that_begin_one_after_another() -> None:
@@ -172,6 +172,84 @@ def test_a_name_by_one_reading_is_tried_with_an_honest_next_one(amount: float, s
         state, evidence = core.step(kernel, state, 201.0, source.tick())
         named = core.identify(kernel, state, evidence, suspicion).found.named
         assert bool(named[4] and evidence.log_m >= kernel.limit) is stays
+
+
+def until_passed(
+    kernel: core.Core, manipulated: Floats, seed: int
+) -> tuple[int, core.CoreState, tuple[core.CoreState, Evidence] | None]:
+    """Last tick and state of a manipulation from tick 200 on, and the state without it, if it passes."""
+    source, state = Source(MODEL, np.random.default_rng(seed)), core.init(kernel, 0.0)
+    suspicion, over, k = None, None, 0
+    for k in range(200 + len(manipulated)):
+        m = source.tick() + (manipulated[k - 200] if k >= 200 else 0.0)
+        state, evidence = core.step(kernel, state, float(k), m)
+        if k < 200 or (k > 205 and k % 4):
+            continue
+        assert core.alarmed(kernel, evidence)
+        suspicion = core.identify(kernel, state, evidence, suspicion)
+        after = core.transition(kernel, state, suspicion)
+        if after is not state:
+            state, suspicion = after, core.identify(kernel, after, evidence, suspicion)
+        over = core.passed(kernel, state, suspicion)
+        if over is not None:
+            break
+    return k, state, over
+
+
+@pytest.mark.parametrize(("seed", "length"), [(0, 1), (1, 4)])
+def test_readings_of_a_transition_that_has_passed_are_given_up(seed: int, length: int) -> None:
+    """The filter is then the dense one with these readings as good as unknown, and nothing is suspected."""
+    kernel, p = core.assemble(MODEL, STEPS_OF_PLACES, np.full(12, 0.1), gamma=1e6), 12
+    manipulated = np.zeros((40, p))
+    manipulated[:length] = np.random.default_rng(seed).normal(0.0, 0.08, (length, p)) * (
+        np.arange(p) % 3 == 1
+    )
+    k, _, over = until_passed(kernel, manipulated, seed)
+    assert over is not None
+    assert core.PASSED <= k - 199 - length <= core.PASSED + 8
+    after, _ = over
+    assert after.detector.log_m < core.CALM * kernel.limit
+    assert not after.detector.pinned.any()
+    again, dense = Source(MODEL, np.random.default_rng(seed)), Dense(MODEL)
+    for tick in range(k + 1):
+        inside = 200 <= tick < 200 + length
+        m = again.tick() + (manipulated[tick - 200] if inside else 0.0)
+        dense.D = MODEL.noise(np.arange(p)) + inside * rivals.APART**2 * np.eye(p)
+        dense.step(float(tick > 0), m)
+    mine = full.expanded(kernel.modes, after.filter, after.static).mean[0]
+    std = np.sqrt(dense.cov[:p, :p].diagonal())
+    # The return to the modes enlarges the covariance.
+    assert (np.abs(mine - dense.varies) < 0.3 * std).all()
+
+
+def test_a_manipulation_that_lasts_does_not_pass() -> None:
+    """Four meters, one more at each tick."""
+    kernel, liars = core.assemble(MODEL, STEPS_OF_PLACES, np.full(12, 0.1), gamma=1e6), np.arange(12) % 3 == 1
+    manipulated = 0.06 * (liars & (np.cumsum(liars) <= np.arange(32)[:, None] + 1))
+    _, state, over = until_passed(kernel, manipulated, 1)
+    assert over is None
+    assert any(each.transition for each in state.rivals)
+
+
+def test_an_onset_after_a_misfit_has_to_explain_it() -> None:
+    """Squares of the innovations count since the earlier onset, of which 4 ticks are off at all meters."""
+    kernel, state = core.assemble(MODEL, STEPS_OF_PLACES, np.full(12, 0.1), gamma=1e6), None
+    source = Source(MODEL, np.random.default_rng(2))
+    state = core.init(kernel, 0.0)
+    for k in range(60):
+        off = 0.02 * np.random.default_rng(k).normal(size=12) * (20 <= k < 24)
+        state, _ = core.step(kernel, state, float(k), source.tick() + off)
+    onsets = detector.followed(kernel.modes, state.detector).onsets
+    row = int(np.flatnonzero(onsets.used & ~onsets.ramp & (onsets.age < 30) & (onsets.age > 5))[0])
+    own, longer = (
+        rivals.replayed(kernel.modes, kernel.rivals, state.history, onsets, row, since)[0]
+        for since in (0, 40)
+    )
+    assert (own.ticks, longer.ticks) == (int(onsets.age[row]), 40)
+    assert own.misfit < 2.0 * own.chance
+    assert longer.misfit > 10.0 * longer.chance
+    assert np.allclose(own.joint().score, longer.joint().score)
+    assert own.evidence == longer.evidence
 
 
 STEPS_OF_PLACES = np.vstack([np.zeros((1, 12)), STEPS])
