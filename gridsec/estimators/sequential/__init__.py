@@ -24,6 +24,7 @@ every switching between them. The residuals are explained by correlated load err
 as few manipulated meters as possible.
 """
 
+from gridsec.estimators.front.posterior import LoadDoubt
 from gridsec.estimators.sequential.design import SequentialDesign, SequentialOptions, design
 from gridsec.estimators.sequential.meter_bias import (
     Commission,
@@ -35,7 +36,6 @@ from gridsec.estimators.sequential.meter_bias import (
     progress,
     to_arrays,
 )
-from gridsec.estimators.sequential.posterior import LoadDoubt
 from gridsec.estimators.sequential.state import (
     ObserverRecord,
     SequentialState,

@@ -16,11 +16,11 @@ from scipy.special import ndtri
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import DesignInfeasible, NotObservable, Problem, raise_if_any
 from gridsec.estimators.detection import curve_mismatch
+from gridsec.estimators.front.posterior import LoadDoubt
 from gridsec.estimators.plant import Plant, check_plant, judging_problems
 from gridsec.estimators.sequential.attack_kind import KindReferences, LoadTraces, look_interval
 from gridsec.estimators.sequential.posterior import (
     UNMETERED,
-    LoadDoubt,
     Prior,
     injection_doubt,
     voltage_prior,

@@ -67,7 +67,7 @@ from scipy.linalg import blas, lapack
 from scipy.special import expit
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices, submatrix
-from gridsec.errors import Problem, raise_if_any
+from gridsec.estimators.front.posterior import LoadDoubt
 from gridsec.grid.devices import Droop, MeterAccuracy
 from gridsec.grid.network import Network, Power, Sensitivities
 
@@ -582,105 +582,6 @@ EXACT = 1e-6
 
 UNMETERED = 0.1
 """Standard deviation of an unmetered squared busbar voltage, squared pu."""
-
-
-LONGEST_S = 1e12
-"""Longest correlation time of power errors, s: longer ones leave nothing to learn."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LoadDoubt:
-    """Uncertainty of the powers in the frames. N customers.
-
-    Attributes
-    ----------
-    p, q : (N,)
-        Standard deviations of the errors of active and reactive power, pu. Larger `p_error`, `q_error` of a
-        frame take precedence.
-    time_s
-        Correlation time of these errors, s; means over much less time contain all of them.
-    common_p, common_q
-        Shares of the variances common to all customers (weather, time of day), 0 to 1.
-    lasting
-        Share of the variances that no mean reduces, 0 to 1: a wrong power factor lasts for years.
-    together : (N,) or one for all
-        Share of both variances in phase with that of all others, 0 to 1: unmetered loads are low together by
-        night, active and reactive.
-    sudden_p, sudden_q : (N,)
-        Parts of p and q that may come and go within a tick, as a power older than its voltage, pu; None for
-        none. `gridsec.estimators.modal.doubts` takes them as unknown at every tick.
-    even_p, even_q : (N,)
-        Derived: half-widths of uniform errors with standard deviations p and q, pu.
-    smooth_p, smooth_q : (N,)
-        Derived: p and q without their sudden parts, pu.
-
-    Raises
-    ------
-    ValueError
-        If a number is not finite, negative, or a share outside [0, 1]; names every problem.
-    """
-
-    p: Floats
-    q: Floats
-    time_s: float
-    common_p: float = 0.0
-    common_q: float = 0.0
-    lasting: float = 0.0
-    together: Floats | float = 0.0
-    sudden_p: Floats | None = None
-    sudden_q: Floats | None = None
-    even_p: Floats = field(init=False, repr=False)
-    even_q: Floats = field(init=False, repr=False)
-    smooth_p: Floats = field(init=False, repr=False)
-    smooth_q: Floats = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        problems = [
-            Problem("negative", f"{name} must be finite and not negative")
-            for name in ("p", "q", "sudden_p", "sudden_q")
-            if not _sizes(getattr(self, name))
-        ]
-        if (self.sudden_p is None) != (self.sudden_q is None):
-            problems.append(Problem("missing", "sudden_p and sudden_q belong together"))
-        problems += [
-            Problem("out-of-range", f"sudden_{name} must have the shape of {name}, and be at most {name}")
-            for name, part, whole in (("p", self.sudden_p, self.p), ("q", self.sudden_q, self.q))
-            if part is not None and (part.shape != whole.shape or (part > whole).any())
-        ]
-        if not 0 < self.time_s <= LONGEST_S:
-            most = f"at most {LONGEST_S:g}; what never changes is `lasting`"
-            problems.append(
-                Problem("out-of-range", f"time_s is {self.time_s}; it must be positive and {most}")
-            )
-        problems += [
-            Problem("out-of-range", f"{name} is {getattr(self, name)}; it must be from 0 to 1")
-            for name in ("common_p", "common_q", "lasting", "together")
-            if not (np.greater_equal(getattr(self, name), 0) & np.less_equal(getattr(self, name), 1)).all()
-        ]
-        raise_if_any(problems)
-        for name, std, sudden in (("p", self.p, self.sudden_p), ("q", self.q, self.sudden_q)):
-            object.__setattr__(self, f"even_{name}", np.sqrt(3.0) * np.maximum(std, EXACT))
-            smooth = std if sudden is None else np.sqrt(std**2 - sudden**2)
-            object.__setattr__(self, f"smooth_{name}", smooth)
-
-    @property
-    def smooth(self) -> LoadDoubt:
-        """The same without the sudden parts."""
-        if self.sudden_p is None:
-            return self
-        return replace(self, p=self.smooth_p, q=self.smooth_q, sudden_p=None, sudden_q=None)
-
-    @property
-    def own(self) -> Floats:
-        """Standard deviations of the parts of p and q that are independent of other customers, (2, N), pu."""
-        alone = np.sqrt(1.0 - self.together)
-        p, q = np.maximum(self.p, EXACT), np.maximum(self.q, EXACT)
-        return np.stack([np.sqrt(1.0 - self.common_p) * alone * p, np.sqrt(1.0 - self.common_q) * alone * q])
-
-
-def _sizes(values: Floats | None) -> bool:
-    """All finite and not negative."""
-    return values is None or bool(np.isfinite(values).all() and (values >= 0).all())
 
 
 def voltage_prior(
