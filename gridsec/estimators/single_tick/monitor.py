@@ -37,10 +37,10 @@ from functools import partial
 import numpy as np
 from scipy.special import ndtri
 
-from gridsec.arrays import Bools, Floats, all_of, any_of, changed
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, changed
 from gridsec.errors import DesignInfeasible
 from gridsec.estimators.detection import Counters, DecisionInputs, count, decide, no_counts
-from gridsec.estimators.plant import NO_VOLTAGE, Options, Plant, nothing_new, usual_options
+from gridsec.estimators.plant import NO_VOLTAGE, Options, Plant, busbar_errors, nothing_new, usual_options
 from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialOptions, SequentialState
 from gridsec.estimators.sequential import design as front_design
 from gridsec.estimators.sequential import init as front_init
@@ -130,6 +130,7 @@ class SingleTickState:
 
     front: SequentialState  # observer, trusted meters, uncertainty of the frame, last output
     tally: Counters  # counters of accusations, and the named meters
+    since: Ints  # (p,) readings since an answer accused the meter
     whole: Posterior | None  # posterior of all meters with a reading; None before the first frame
 
 
@@ -176,7 +177,9 @@ def design(
 
 def init(design: SingleTickDesign, t: float) -> SingleTickState:
     """Initial state at Unix time t, s; the observer starts at the first frame and trusts all meters."""
-    return SingleTickState(front_init(design.front, t), no_counts(design.noise.size), None)
+    p = design.noise.size
+    never = np.full(p, design.options.release, dtype=np.intp)
+    return SingleTickState(front_init(design.front, t), no_counts(p), never, None)
 
 
 # --- Step ---
@@ -203,11 +206,12 @@ def step(
     if any_of(driving):
         # The injections follow these readings, and the residuals of all other meters follow the injections.
         tick = _decoded(design, state, frame, trusted & ~driving)
-    left = _left(front, tick, (state.tally.above > 0) | tick.possible)
-    tally = _counted(design, state.tally, tick, left)
+    left = _left(front, tick, (state.since < design.options.release) | tick.possible)
+    tally, since = _counted(design, state, tick, left)
+    suspect = since < design.options.release
     estimate = _estimate(design, tick, left)
-    answer = _verdict(design, tick, left, tally, estimate)
-    after = ~((tally.above > 0) | tick.possible)
+    answer = _verdict(design, tick, left, (tally.named, suspect), estimate)
+    after = ~suspect
     now, new = tick.predicted, trusted & ~after
     given = changed(
         _trusting(given, after),
@@ -225,7 +229,7 @@ def step(
         busbar_history=history,
         last=(estimate, answer),
     )
-    return SingleTickState(given, tally, tick.whole), estimate, answer
+    return SingleTickState(given, tally, since, tick.whole), estimate, answer
 
 
 def _trusting(given: SequentialState, trusted: Bools) -> SequentialState:
@@ -378,38 +382,44 @@ def _false_busbar(front: SequentialDesign, tick: _Tick, least: float) -> tuple[B
     """Phases of the busbar with a reading that explains all others if it is false, and their misfits, (b,).
 
     The busbar voltage of the phase counts as unmetered. All meters are then within their limits, and together
-    as well. The misfit exceeds that of the meters that are left, `least`, by at most ``2 log RIVAL_RATIO``.
-    The misfits are given above `least`.
+    as well. The busbar voltage by the meters is further from the reading than an honest error. The misfit
+    exceeds that of the meters that are left, `least`, by at most ``2 log RIVAL_RATIO``. The misfits are given
+    above `least`.
     """
-    metered = np.atleast_1d(tick.measured.busbar_metered)
+    plant, metered = front.plant, np.atleast_1d(tick.measured.busbar_metered)
     rivals, worse = np.zeros(metered.size, dtype=np.bool_), np.zeros(metered.size)
     whole, m, limits = tick.whole, tick.m, tick.limits
+    honest = np.atleast_1d(busbar_errors(plant, tick.measured.v0_squared, limits.sigmas))
     for k in np.flatnonzero(metered).tolist():
-        phase = np.arange(metered.size) == k
-        level = front.plant.feeder.broadcast_busbar(np.where(phase, UNMETERED, 0.0))
+        level = plant.feeder.broadcast_busbar(np.where(np.arange(metered.size) == k, UNMETERED, 0.0))
         now = condition(whole.prior, whole.noise, whole.trusted, level[:, None])
         loo = leave_one_out(now, m)
         within = all_of(np.abs(loo.residual) <= limits.limit(loo.std)) and not _misfit(now, loo, limits)
+        false = abs(loo.mean[plant.feeder.busbar_places()][k]) > honest[k]
         worse[k] = loo.chi_square - least
-        rivals[k] = within and worse[k] <= 2.0 * np.log(RIVAL_RATIO)
+        rivals[k] = within and false and worse[k] <= 2.0 * np.log(RIVAL_RATIO)
     return rivals, worse
 
 
-def _counted(design: SingleTickDesign, before: Counters, tick: _Tick, left: _Left) -> Counters:
-    """Counters after the accusations of a tick.
+def _counted(
+    design: SingleTickDesign, state: SingleTickState, tick: _Tick, left: _Left
+) -> tuple[Counters, Ints]:
+    """Counters after the accusations of a tick, and readings since an answer accused each meter, (p,).
 
     An accusation that some rival does without counts neither for nor against a meter; a named one stays
     named while any answer accuses it.
     """
+    options, named, possible = design.options, state.tally.named, tick.possible
     certain = left.supported & tick.common
     if any_of(left.phases):
         certain = np.zeros_like(certain)
-    over = certain | (tick.possible & before.named)
-    counts = tick.measured.available & (over | ~tick.possible)
+    over, read = certain | (possible & named), tick.measured.available
     if not tick.answers:
-        counts = np.zeros_like(counts)
-    options = design.options
-    return count(before, over, counts, confirm=options.confirm, release=options.release)
+        read = np.zeros_like(read)
+    tally = count(
+        state.tally, over, read & (over | ~possible), confirm=options.confirm, release=options.release
+    )
+    return tally, np.where(possible, 0, state.since + read)
 
 
 # --- Estimate ---
@@ -446,12 +456,12 @@ _Finding = tuple[Decision, Cause, str]
 
 
 def _verdict(
-    design: SingleTickDesign, tick: _Tick, left: _Left, tally: Counters, estimate: Estimate
+    design: SingleTickDesign, tick: _Tick, left: _Left, accused: tuple[Bools, Bools], estimate: Estimate
 ) -> Verdict:
-    """Verdict of a tick."""
-    front, measured, named = design.front, tick.measured, tally.named
+    """Verdict of a tick; accused: named and suspect meters, (p,) each."""
+    front, measured, named = design.front, tick.measured, accused[0]
     residual, busbar = np.abs(left.loo.residual), front.busbar_incidence.shape[1]
-    finding = _of_meters(design, tick, left, tally)
+    finding = _of_meters(design, tick, left, *accused)
     finding = _unsolved(tick, finding)
     rivals = _rivals(design, tick, left)
     if rivals and finding[1] in (Cause.AGREEMENT, Cause.AMBIGUOUS):
@@ -473,9 +483,9 @@ def _verdict(
     )
 
 
-def _of_meters(design: SingleTickDesign, tick: _Tick, left: _Left, tally: Counters) -> _Finding:
-    """Verdict on the meters."""
-    front, available, named = design.front, tick.measured.available, tally.named
+def _of_meters(design: SingleTickDesign, tick: _Tick, left: _Left, named: Bools, suspect: Bools) -> _Finding:
+    """Verdict on the meters; named, suspect: (p,)."""
+    front, available = design.front, tick.measured.available
     most = max(1, min(front.max_attacked, int(np.count_nonzero(available)) // 3))
     settled = all_of(tick.predicted.transient <= design.options.settled * left.limit)
     finding = decide(
@@ -483,7 +493,7 @@ def _of_meters(design: SingleTickDesign, tick: _Tick, left: _Left, tally: Counte
             names=front.names,
             max_attacked=most,
             live=available,
-            suspected=(tally.above > 0) | tick.possible | left.beyond,
+            suspected=suspect | left.beyond,
             named=named,
             wide=available & ~(left.limit <= design.options.widest),
             valid=True,
