@@ -31,7 +31,6 @@ from gridsec.estimators import (
     exact_bank,
     front,
     partial,
-    sequential,
     set_search,
     single_tick,
     unknown_input,
@@ -40,7 +39,6 @@ from gridsec.estimators import (
 from gridsec.estimators.exact_bank.bank import MOST_OBSERVERS, Gains
 from gridsec.estimators.front import Commission, LearningProgress, ObserverRecord, SuspicionRecord
 from gridsec.estimators.modal import monitor as modal
-from gridsec.estimators.sequential.search import Decoder
 from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.certificates import certify
 from gridsec.observers.design_archive import cached
@@ -420,7 +418,10 @@ def _lmi_bank(site: Site, job: DesignOptions) -> exact_bank.MonitorDesign:
 
 
 def _certificate(
-    design: exact_bank.MonitorDesign | front.FrontDesign | set_search.SetSearchDesign,
+    design: exact_bank.MonitorDesign
+    | modal.ModalDesign
+    | set_search.SetSearchDesign
+    | single_tick.SingleTickDesign,
 ) -> str:
     proof = design.certificate
     return f"{proof.kind} certificate, margin {proof.margin:.3g}, decay at least {proof.rate:.3g} 1/s"
@@ -503,10 +504,10 @@ def _load_columns(site: Site) -> Floats:
     return np.hstack([2.0 * model.R * dp, 2.0 * model.X * dq])
 
 
-def _ticks(name: str, summary: str, decoder: Decoder) -> Estimator:
+def _ticks(name: str, summary: str, decoder: single_tick.Decoder) -> Estimator:
     """Estimator that tests every tick by itself."""
 
-    def make(site: Site, _: DesignOptions) -> sequential.SequentialDesign:
+    def make(site: Site, _: DesignOptions) -> single_tick.SingleTickDesign:
         settings = site.tables.meta.monitor
         return single_tick.design(
             plant(site),
@@ -515,9 +516,10 @@ def _ticks(name: str, summary: str, decoder: Decoder) -> Estimator:
             step_s=settings.tick_s,
             max_attacked=settings.max_attacked,
             alarms_per_year=settings.alarms_per_year,
+            unread_std_percent=settings.unread_std_percent,
         )
 
-    return _of(sequential, name, summary, design=make)
+    return _of(single_tick, name, summary, design=make)
 
 
 class Families(Mapping[str, Estimator]):

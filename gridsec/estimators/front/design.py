@@ -57,6 +57,8 @@ class FrontOptions:
     unread_std_percent
         Largest standard deviation of the voltage at a metered customer without a power reading for which the
         verdict can be CLEAN, % of nominal.
+    largest_offset_s
+        Largest clock offset of a usable reading, s; a quarter of a tick where that is longer.
     widest, v2_limits, settled
         As in `gridsec.estimators.plant.Options`.
 
@@ -76,6 +78,7 @@ class FrontOptions:
     commission_s: float = 86400.0
     stability: float = 0.1
     unread_std_percent: float = 0.5
+    largest_offset_s: float = 15.0
     widest: float = 0.1
     v2_limits: tuple[float, float] = (0.25, 2.25)
     settled: float = 0.1
@@ -95,7 +98,7 @@ class FrontOptions:
             ("like", 1.0 <= self.like < np.inf, Problem("out-of-range", "must be at least 1 and finite")),
             *(
                 (name, 0.0 <= getattr(self, name) < np.inf, zero)
-                for name in ("commission_s", "stability", "unread_std_percent")
+                for name in ("commission_s", "stability", "unread_std_percent", "largest_offset_s")
             ),
         ]
         raise_if_any(

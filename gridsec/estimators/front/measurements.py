@@ -193,17 +193,13 @@ FALSE_Q = 0.5
 # --- Clock offsets ---
 
 
-_LARGEST_OFFSET_S = 15.0
-"""Largest clock offset of a usable reading where ticks are short, s."""
-
-
 _TICK_PART = 0.25
-"""The same where ticks are long, as a part of a tick."""
+"""Largest clock offset of a usable reading where ticks are long, as a part of a tick."""
 
 
 def largest_offset(design: FrontDesign) -> float:
     """Largest clock offset of a usable reading, s."""
-    return max(_LARGEST_OFFSET_S, _TICK_PART * design.step_s)
+    return max(design.options.largest_offset_s, _TICK_PART * design.step_s)
 
 
 def unusable_offsets(design: FrontDesign, offset_s: Floats | None) -> Bools | None:

@@ -85,6 +85,7 @@ def test_options_of_the_front_end_are_checked_alike() -> None:
     wrong = {
         "alarms_per_year": 0.0, "enough": 0.0, "release": 0, "suspect": 1.0, "lower": np.nan, "like": 0.5,
         "hidden_power": 0.0, "commission_s": np.nan, "stability": -0.1, "unread_std_percent": -1.0,
+        "largest_offset_s": -1.0,
         "widest": np.nan, "v2_limits": (np.nan, 1.0), "settled": np.nan,
     }  # fmt: skip
     with pytest.raises(InputInvalid) as caught:
@@ -97,7 +98,8 @@ def test_options_of_the_front_end_are_checked_alike() -> None:
         "alarms_per_year": "not-positive", "enough": "out-of-range", "release": "out-of-range",
         "suspect": "out-of-range", "lower": "out-of-range", "like": "out-of-range",
         "hidden_power": "not-positive", "commission_s": "negative", "stability": "negative",
-        "unread_std_percent": "negative", "widest": "not-positive", "v2_limits": "order",
+        "unread_std_percent": "negative",
+        "largest_offset_s": "negative", "widest": "not-positive", "v2_limits": "order",
         "settled": "out-of-range",
     }  # fmt: skip
 
