@@ -17,8 +17,9 @@ A step, in this order:
    single accusation is an impulse, or chance.
 4. *Estimate.* Posterior of the voltages by the meters without any accusation, with its standard deviation
    and bound.
-5. *Verdict.* CLEAN only if all meters are read, none is accused, the rest fits the feeder (chi-square,
-   largest leave-one-out residual, busbar), and the observer has settled. UNDECIDED has a cause.
+5. *Verdict.* CLEAN only if all meters are read, no answer has accused one for `release` readings, the rest
+   fits the feeder (chi-square, largest leave-one-out residual), and the observer has settled. UNDECIDED has
+   a cause.
 
 The limits of all meters and the test of chi-square have equal shares of `alarms_per_year`:
 
@@ -86,6 +87,7 @@ from gridsec.estimators.single_tick.decoders import (
     Limits,
     check,
     fewest,
+    misfits,
 )
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.observers.certificates import Certificate
@@ -357,25 +359,11 @@ def _left(front: SequentialDesign, tick: _Tick, suspect: Bools) -> _Left:
         other = leave_one_out(beside, m)
         supported = beyond & (np.abs(other.residual) > limits.limit(other.std))
         added = np.maximum(beside.variance - now.variance, 0.0) + (loo.mean - other.mean) ** 2
-    misfit, phases = _misfit(now, loo, limits), np.zeros(front.busbar_incidence.shape[1], dtype=np.bool_)
-    worse = np.zeros(phases.size)
+    misfit, worse = misfits(now, loo, limits, now.count), np.zeros(front.busbar_incidence.shape[1])
+    phases = np.zeros(worse.size, dtype=np.bool_)
     if misfit or any_of(tick.possible) or any_of(beyond):
         phases, worse = _false_busbar(front, tick, loo.chi_square)
     return _Left(suspect, now, loo, limit, beyond, supported, added, misfit, phases, worse)
-
-
-def _misfit(now: Posterior, loo: LeaveOneOut, limits: Limits) -> bool:
-    """True where ``sqrt(m^T Q m)`` is above the root of its quantile by more than the model's error.
-
-    An error of the model of at most e_j at meter j adds at most ``sqrt(e^T |Q| e)`` to the root.
-    """
-    if not now.count:
-        return False
-    beyond = np.sqrt(max(loo.chi_square, 0.0)) - np.sqrt(limits.chi_square(now.count, now.count))
-    if beyond <= 0.0:
-        return False
-    at, Q = now.precision()
-    return bool(beyond > np.sqrt(limits.model[at] @ np.abs(Q) @ limits.model[at]))
 
 
 def _false_busbar(front: SequentialDesign, tick: _Tick, least: float) -> tuple[Bools, Floats]:
@@ -394,10 +382,11 @@ def _false_busbar(front: SequentialDesign, tick: _Tick, least: float) -> tuple[B
         level = plant.feeder.broadcast_busbar(np.where(np.arange(metered.size) == k, UNMETERED, 0.0))
         now = condition(whole.prior, whole.noise, whole.trusted, level[:, None])
         loo = leave_one_out(now, m)
-        within = all_of(np.abs(loo.residual) <= limits.limit(loo.std)) and not _misfit(now, loo, limits)
-        false = abs(loo.mean[plant.feeder.busbar_places()][k]) > honest[k]
         worse[k] = loo.chi_square - least
-        rivals[k] = within and false and worse[k] <= 2.0 * np.log(RIVAL_RATIO)
+        beyond = any_of(whole.trusted & (np.abs(loo.residual) > limits.limit(loo.std)))
+        false = abs(loo.mean[plant.feeder.busbar_places()][k]) > honest[k]
+        likely = worse[k] <= 2.0 * np.log(RIVAL_RATIO)
+        rivals[k] = false and likely and not beyond and not misfits(now, loo, limits, now.count)
     return rivals, worse
 
 
@@ -574,17 +563,16 @@ def _of_busbar(design: SingleTickDesign, tick: _Tick, left: _Left, finding: _Fin
 
 def _unread_powers(design: SingleTickDesign, tick: _Tick, estimate: Estimate, finding: _Finding) -> _Finding:
     """UNDECIDED where the voltage beside an unread power is too uncertain."""
-    unread = ~tick.uncertainty.vouched[0] & tick.measured.available
-    if finding[0] is not Decision.CLEAN or not any_of(unread):
+    front, origins = design.front, tick.measured.frame.p_origin
+    if finding[0] is not Decision.CLEAN or origins is None:
         return finding
-    front, frame = design.front, tick.measured.frame
+    unread = ~tick.uncertainty.vouched[0] & tick.measured.available
     at, limit = front.plant.meters, front.options.unread_std_percent
     v = np.sqrt(np.maximum(estimate.v2[at], _LEAST_V2))
     percent = 50.0 * estimate.std[at] / (v * front.plant.droop.vbar)
     wide = unread & ~(percent <= limit)
     if not any_of(wide):
         return finding
-    origins = np.zeros(frame.p.size, dtype=np.intp) if frame.p_origin is None else frame.p_origin
     sentence = unread_sentence(front.names, wide, origins[at], percent, limit)
     return Decision.UNDECIDED, Cause.MISSING_POWERS, sentence
 
