@@ -66,19 +66,18 @@ _LEAST_TAIL = 1e-300
 """Least tail probability with a finite quantile, 1."""
 
 
-def misfits(now: Posterior, loo: LeaveOneOut, limits: Limits, meters: int) -> bool:
+def misfits(now: Posterior, loo: LeaveOneOut, limits: Limits, meters: int | None = None) -> bool:
     """True where the trusted meters of a posterior, taken together, are beyond chance and the model's error.
 
     An error of the model of at most e_j at meter j adds at most ``sqrt(e^T |Q| e)`` to ``sqrt(m^T Q m)``. The
-    probability by chance is that of the limits of `meters` meters together.
+    probability by chance is that of the limits of `meters` meters together, of the trusted ones by default.
     """
-    if not now.count:
+    count = int(np.count_nonzero(now.trusted))
+    if not count:
         return False
-    beyond = np.sqrt(max(loo.chi_square, 0.0)) - np.sqrt(limits.chi_square(meters, now.count))
-    if beyond <= 0.0:
-        return False
-    at, Q = now.precision()
-    return bool(beyond > np.sqrt(limits.model[at] @ np.abs(Q) @ limits.model[at]))
+    quantile = limits.chi_square(count if meters is None else meters, count)
+    beyond = np.sqrt(max(loo.chi_square, 0.0)) - np.sqrt(quantile)
+    return bool(beyond > 0.0 and beyond > np.sqrt(limits.model @ np.abs(now.Q) @ limits.model))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -74,8 +74,6 @@ from gridsec.estimators.sequential.posterior import (
     Prior,
     condition,
     leave_one_out,
-    remove_meters,
-    well_conditioned,
 )
 from gridsec.estimators.sequential.state import Prediction
 from gridsec.estimators.sequential.step import predict
@@ -295,21 +293,11 @@ def _decoded(design: SingleTickDesign, state: SingleTickState, frame: Frame, tru
     return _Tick(measured, predicted, uncertainty, skew, m, limits, whole, answers)
 
 
-def _posterior(before: Posterior | None, prior: Prior, noise: Floats, available: Bools) -> Posterior:
-    """Posterior of the meters `available` (p,), from the one before where that has all of them."""
-    same = before is not None and before.prior is prior and np.array_equal(before.noise, noise)
-    if before is None or not same or any_of(available & ~before.trusted):
-        return condition(prior, noise, available)
-    return _without(before, ~available)
-
-
-def _without(now: Posterior, removed: Bools) -> Posterior:
-    """Posterior without the meters `removed` (p,); the given one where it has none of them."""
-    if not any_of(now.trusted & removed):
-        return now
-    if well_conditioned(now.prior, now.noise):
-        return remove_meters(now, removed)
-    return condition(now.prior, now.noise, now.trusted & ~removed)
+def _posterior(before: Posterior | None, prior: Prior, noise: Floats, trusted: Bools) -> Posterior:
+    """Posterior of the meters `trusted` (p,); the one before where it is the same."""
+    if before is None or before.prior is not prior or not np.array_equal(before.trusted, trusted):
+        return condition(prior, noise, trusted)
+    return before if np.array_equal(before.noise, noise) else condition(prior, noise, trusted)
 
 
 def _model_error(front: SequentialDesign, powers: PowerErrors) -> Floats:
@@ -347,7 +335,8 @@ class _Left:
 
 def _left(front: SequentialDesign, tick: _Tick, suspect: Bools) -> _Left:
     """Tests without the meters `suspect` (p,)."""
-    now, m, limits, available = _without(tick.whole, suspect), tick.m, tick.limits, tick.measured.available
+    whole, m, limits, available = tick.whole, tick.m, tick.limits, tick.measured.available
+    now = _posterior(whole, whole.prior, whole.noise, whole.trusted & ~suspect)
     loo = leave_one_out(now, m)
     limit = limits.limit(loo.std)
     beyond = available & (np.abs(loo.residual) > limit)
@@ -355,11 +344,11 @@ def _left(front: SequentialDesign, tick: _Tick, suspect: Bools) -> _Left:
     vouched = tick.uncertainty.vouched[0]
     if any_of(now.trusted & ~vouched):
         # A reading beside an unread power has no check of its own.
-        beside = _without(now, ~vouched)
+        beside = condition(now.prior, now.noise, now.trusted & vouched)
         other = leave_one_out(beside, m)
         supported = beyond & (np.abs(other.residual) > limits.limit(other.std))
         added = np.maximum(beside.variance - now.variance, 0.0) + (loo.mean - other.mean) ** 2
-    misfit, worse = misfits(now, loo, limits, now.count), np.zeros(front.busbar_incidence.shape[1])
+    misfit, worse = misfits(now, loo, limits), np.zeros(front.busbar_incidence.shape[1])
     phases = np.zeros(worse.size, dtype=np.bool_)
     if misfit or any_of(tick.possible) or any_of(beyond):
         phases, worse = _false_busbar(front, tick, loo.chi_square)
@@ -380,14 +369,20 @@ def _false_busbar(front: SequentialDesign, tick: _Tick, least: float) -> tuple[B
     honest = np.atleast_1d(busbar_errors(plant, tick.measured.v0_squared, limits.sigmas))
     for k in np.flatnonzero(metered).tolist():
         level = plant.feeder.broadcast_busbar(np.where(np.arange(metered.size) == k, UNMETERED, 0.0))
-        now = condition(whole.prior, whole.noise, whole.trusted, level[:, None])
+        now = condition(_with_direction(whole.prior, level), whole.noise, whole.trusted)
         loo = leave_one_out(now, m)
         worse[k] = loo.chi_square - least
         beyond = any_of(whole.trusted & (np.abs(loo.residual) > limits.limit(loo.std)))
         false = abs(loo.mean[plant.feeder.busbar_places()][k]) > honest[k]
         likely = worse[k] <= 2.0 * np.log(RIVAL_RATIO)
-        rivals[k] = false and likely and not beyond and not misfits(now, loo, limits, now.count)
+        rivals[k] = false and likely and not beyond and not misfits(now, loo, limits)
     return rivals, worse
+
+
+def _with_direction(prior: Prior, direction: Floats) -> Prior:
+    """``S + d d^T``: the prior with an unknown direction d (n,) times its standard deviation, squared pu."""
+    more = np.multiply.outer(direction, direction[prior.meters])
+    return Prior(prior.covariance + more, prior.meters, prior.variance + direction**2)
 
 
 def _counted(
@@ -549,7 +544,7 @@ def _of_busbar(design: SingleTickDesign, tick: _Tick, left: _Left, finding: _Fin
     if finding[0] is not Decision.CLEAN:
         return finding
     front, metered = design.front, np.atleast_1d(tick.measured.busbar_metered)
-    most = max(1, min(front.max_attacked, left.posterior.count // 3))
+    most = max(1, min(front.max_attacked, int(np.count_nonzero(left.posterior.trusted)) // 3))
     reporting = (front.busbar_incidence[left.posterior.trusted] > 0.0).sum(axis=0)
     few = reporting[~metered]
     if not any_of(few <= 2 * most):

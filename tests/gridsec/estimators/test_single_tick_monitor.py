@@ -271,7 +271,7 @@ class TestConfirmation:
 
 @ALL
 def test_meters_without_any_error_are_used_as_such(decoder: Decoder) -> None:
-    """Updates of a posterior are not exact enough at their precision: each set is factorised."""
+    """Without fixed error, jitter and rounding the errors of the model alone are in the limits."""
     rng = np.random.default_rng(26)
     plant = make_plant(rng, customers=8, drop=0.04)
     none = np.zeros(8)
