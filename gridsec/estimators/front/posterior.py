@@ -42,11 +42,6 @@ class Prior:
     meters: Ints  # (p,) bus of each meter
     variance: Floats  # (n,) variance at every bus
 
-    def with_direction(self, direction: Floats) -> Prior:
-        """Prior with one more unknown direction d (n,), times its standard deviation: ``S + d d^T``."""
-        more = self.covariance + np.multiply.outer(direction, direction[self.meters])
-        return Prior(more, self.meters, self.variance + direction**2)
-
     def among(self, at: Ints) -> Floats:
         """Covariance between the buses of meters `at` (k,), (k, k), in the order of LAPACK."""
         # Symmetric: the transpose is the same in the order of LAPACK.
@@ -248,11 +243,6 @@ class Posterior:
     trusted: Bools  # (p,) meters conditioned on
     Q: Floats  # (p, p) precision of the trusted meters, zero elsewhere
     variance: Floats  # (n,) diagonal of M
-
-    @property
-    def count(self) -> int:
-        """Number of trusted meters."""
-        return int(np.count_nonzero(self.trusted))
 
     def copy(self) -> Posterior:
         """Copy that can be changed alone."""

@@ -17,8 +17,9 @@ A step, in this order:
    single accusation is an impulse, or chance.
 4. *Estimate.* Posterior of the voltages by the meters without any accusation, with its standard deviation
    and bound.
-5. *Verdict.* CLEAN only if all meters are read, none is accused, the rest fits the feeder (chi-square,
-   largest leave-one-out residual, busbar), and the observer has settled. UNDECIDED has a cause.
+5. *Verdict.* CLEAN only if all meters are read, no answer has accused one for `release` readings, the rest
+   fits the feeder (chi-square, largest leave-one-out residual), and the observer has settled. UNDECIDED has
+   a cause.
 
 The limits of all meters and the test of chi-square have equal shares of `alarms_per_year`:
 
@@ -85,6 +86,7 @@ from gridsec.estimators.single_tick.decoders import (
     Limits,
     check,
     fewest,
+    misfits,
 )
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 from gridsec.observers.certificates import Certificate
@@ -300,19 +302,11 @@ def _prior(front: FrontDesign, state: SingleTickState, now: FrameUncertainty) ->
     return state.whole.prior if same and state.whole is not None else frame_prior(front, now)
 
 
-def _posterior(before: Posterior | None, prior: Prior, noise: Floats, available: Bools) -> Posterior:
-    """Posterior of the meters `available` (p,), from the one before where that has all of them."""
-    same = before is not None and before.prior is prior and np.array_equal(before.noise, noise)
-    if before is None or not same or any_of(available & ~before.trusted):
-        return condition(prior, noise, available)
-    return _without(before, ~available)
-
-
-def _without(now: Posterior, removed: Bools) -> Posterior:
-    """Posterior without the meters `removed` (p,); the given one where it has none of them."""
-    if not any_of(now.trusted & removed):
-        return now
-    return condition(now.prior, now.noise, now.trusted & ~removed)
+def _posterior(before: Posterior | None, prior: Prior, noise: Floats, trusted: Bools) -> Posterior:
+    """Posterior of the meters `trusted` (p,); the one before where it is the same."""
+    if before is None or before.prior is not prior or not np.array_equal(before.trusted, trusted):
+        return condition(prior, noise, trusted)
+    return before if np.array_equal(before.noise, noise) else condition(prior, noise, trusted)
 
 
 def _model_error(front: FrontDesign, powers: PowerErrors) -> Floats:
@@ -350,7 +344,8 @@ class _Left:
 
 def _left(front: FrontDesign, tick: _Tick, suspect: Bools) -> _Left:
     """Tests without the meters `suspect` (p,)."""
-    now, m, limits, available = _without(tick.whole, suspect), tick.m, tick.limits, tick.measured.available
+    whole, m, limits, available = tick.whole, tick.m, tick.limits, tick.measured.available
+    now = _posterior(whole, whole.prior, whole.noise, whole.trusted & ~suspect)
     loo = leave_one_out(now, m)
     limit = limits.limit(loo.std)
     beyond = available & (np.abs(loo.residual) > limit)
@@ -358,28 +353,15 @@ def _left(front: FrontDesign, tick: _Tick, suspect: Bools) -> _Left:
     vouched = tick.uncertainty.vouched
     if any_of(now.trusted & ~vouched):
         # A reading beside an unread power has no check of its own.
-        beside = _without(now, ~vouched)
+        beside = condition(now.prior, now.noise, now.trusted & vouched)
         other = leave_one_out(beside, m)
         supported = beyond & (np.abs(other.residual) > limits.limit(other.std))
         added = np.maximum(beside.variance - now.variance, 0.0) + (loo.mean - other.mean) ** 2
-    misfit, phases = _misfit(now, loo, limits), np.zeros(front.busbar_incidence.shape[1], dtype=np.bool_)
-    worse = np.zeros(phases.size)
+    misfit, worse = misfits(now, loo, limits), np.zeros(front.busbar_incidence.shape[1])
+    phases = np.zeros(worse.size, dtype=np.bool_)
     if misfit or any_of(tick.possible) or any_of(beyond):
         phases, worse = _false_busbar(front, tick, loo.chi_square)
     return _Left(suspect, now, loo, limit, beyond, supported, added, misfit, phases, worse)
-
-
-def _misfit(now: Posterior, loo: LeaveOneOut, limits: Limits) -> bool:
-    """True where ``sqrt(m^T Q m)`` is above the root of its quantile by more than the model's error.
-
-    An error of the model of at most e_j at meter j adds at most ``sqrt(e^T |Q| e)`` to the root.
-    """
-    if not now.count:
-        return False
-    beyond = np.sqrt(max(loo.chi_square, 0.0)) - np.sqrt(limits.chi_square(now.count, now.count))
-    if beyond <= 0.0:
-        return False
-    return bool(beyond > np.sqrt(limits.model @ np.abs(now.Q) @ limits.model))
 
 
 def _false_busbar(front: FrontDesign, tick: _Tick, least: float) -> tuple[Bools, Floats]:
@@ -396,13 +378,20 @@ def _false_busbar(front: FrontDesign, tick: _Tick, least: float) -> tuple[Bools,
     honest = np.atleast_1d(busbar_errors(plant, tick.measured.v0_squared, limits.sigmas))
     for k in np.flatnonzero(metered).tolist():
         level = plant.feeder.broadcast_busbar(np.where(np.arange(metered.size) == k, UNMETERED, 0.0))
-        now = condition(whole.prior.with_direction(level), whole.noise, whole.trusted)
+        now = condition(_with_direction(whole.prior, level), whole.noise, whole.trusted)
         loo = leave_one_out(now, m)
-        within = all_of(np.abs(loo.residual) <= limits.limit(loo.std)) and not _misfit(now, loo, limits)
-        false = abs(loo.mean[plant.feeder.busbar_places()][k]) > honest[k]
         worse[k] = loo.chi_square - least
-        rivals[k] = within and false and worse[k] <= 2.0 * np.log(RIVAL_RATIO)
+        beyond = any_of(whole.trusted & (np.abs(loo.residual) > limits.limit(loo.std)))
+        false = abs(loo.mean[plant.feeder.busbar_places()][k]) > honest[k]
+        likely = worse[k] <= 2.0 * np.log(RIVAL_RATIO)
+        rivals[k] = false and likely and not beyond and not misfits(now, loo, limits)
     return rivals, worse
+
+
+def _with_direction(prior: Prior, direction: Floats) -> Prior:
+    """``S + d d^T``: the prior with an unknown direction d (n,) times its standard deviation, squared pu."""
+    more = np.multiply.outer(direction, direction[prior.meters])
+    return Prior(prior.covariance + more, prior.meters, prior.variance + direction**2)
 
 
 def _counted(
@@ -564,7 +553,7 @@ def _of_busbar(design: SingleTickDesign, tick: _Tick, left: _Left, finding: _Fin
     if finding[0] is not Decision.CLEAN:
         return finding
     front, metered = design.front, np.atleast_1d(tick.measured.busbar_metered)
-    most = max(1, min(front.max_attacked, left.posterior.count // 3))
+    most = max(1, min(front.max_attacked, int(np.count_nonzero(left.posterior.trusted)) // 3))
     reporting = (front.busbar_incidence[left.posterior.trusted] > 0.0).sum(axis=0)
     few = reporting[~metered]
     if not any_of(few <= 2 * most):
@@ -578,17 +567,16 @@ def _of_busbar(design: SingleTickDesign, tick: _Tick, left: _Left, finding: _Fin
 
 def _unread_powers(design: SingleTickDesign, tick: _Tick, estimate: Estimate, finding: _Finding) -> _Finding:
     """UNDECIDED where the voltage beside an unread power is too uncertain."""
-    unread = ~tick.uncertainty.vouched & tick.measured.available
-    if finding[0] is not Decision.CLEAN or not any_of(unread):
+    front, origins = design.front, tick.measured.frame.p_origin
+    if finding[0] is not Decision.CLEAN or origins is None:
         return finding
-    front, frame = design.front, tick.measured.frame
+    unread = ~tick.uncertainty.vouched & tick.measured.available
     at, limit = front.plant.meters, front.options.unread_std_percent
     v = np.sqrt(np.maximum(estimate.v2[at], _LEAST_V2))
     percent = 50.0 * estimate.std[at] / (v * front.plant.droop.vbar)
     wide = unread & ~(percent <= limit)
     if not any_of(wide):
         return finding
-    origins = np.zeros(frame.p.size, dtype=np.intp) if frame.p_origin is None else frame.p_origin
     sentence = unread_sentence(front.names, wide, origins[at], percent, limit)
     return Decision.UNDECIDED, Cause.MISSING_POWERS, sentence
 

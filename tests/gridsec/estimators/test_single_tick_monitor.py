@@ -269,6 +269,29 @@ class TestConfirmation:
         assert (np.abs(estimate.v2 - street.truth()) <= estimate.bound).all()
 
 
+@ALL
+def test_meters_without_any_error_are_used_as_such(decoder: Decoder) -> None:
+    """Without fixed error, jitter and rounding the errors of the model alone are in the limits."""
+    rng = np.random.default_rng(26)
+    plant = make_plant(rng, customers=8, drop=0.04)
+    none = np.zeros(8)
+    exact = replace(plant.accuracy, class_fraction=none, resolution=none, jitter=none)
+    street = Street(plant, rng)
+    design = prepare(replace(plant, accuracy=exact), decoder)
+
+    def read(factor: Floats) -> Callable[[Frame], Frame]:
+        return lambda frame: replace(frame, y=street.truth() * factor, v0_squared=street.v0**2)
+
+    state, answers = watch(street, design, 40, change=read(np.ones(8)))
+    assert answers[-1][1].decision is Decision.CLEAN
+    lie = np.where(np.arange(8) == 5, 1.1, 1.0)
+    _, answers = watch(street, design, 4, state=state, change=read(lie))
+    # Basis pursuit weighs an attack by the deviation of the meter: false loads cost less than a false meter.
+    found = (Decision.UNDECIDED, ()) if decoder is pursue else (Decision.ATTACKED, (5,))
+    assert (answers[-1][1].decision, who(answers[-1][1].suspects)) == found
+    assert (np.abs(answers[-1][0].v2 - street.truth()) <= answers[-1][0].bound).all()
+
+
 # ------------------------------------------------------------------------------------------------ undecided
 
 
@@ -323,6 +346,16 @@ class TestUndecided:
         _, answers = watch(Street(plant, rng), prepare(plant, decoder), 2)
         assert [verdict.cause for _, verdict in answers] == [Cause.SETTLING] * 2
 
+    def test_a_frame_without_a_time_comes_first(self, decoder: Decoder) -> None:
+        rng = np.random.default_rng([25, 1])
+        plant = make_plant(rng)
+        design, street = prepare(plant, decoder), Street(plant, rng)
+        start = single_tick.init(design, street.t)
+        state, estimate, verdict = single_tick.step(design, start, replace(street.frame(), t=np.nan))
+        assert state is start
+        assert (verdict.decision, verdict.cause) == (Decision.UNDECIDED, Cause.SETTLING)
+        assert np.isfinite([estimate.v2, estimate.std, estimate.bound]).all()
+
     def test_no_reading_at_all(self, decoder: Decoder) -> None:
         street, design, state = settled(decoder, 4)
         state, answers = watch(street, design, 3, state=state, silent=tuple(range(12)))
@@ -350,6 +383,9 @@ class TestUndecided:
         assert all(any(each.busbar.all() and not each.meters.any() for each in some) for some in told)
         estimate = answers[-1][0]
         assert (np.abs(estimate.v2 - street.truth()) <= estimate.bound).all()
+        # A silent meter is no evidence against it.
+        _, answers = watch(street, design, 4, state=state, silent=(6,), change=false)
+        assert not any(verdict.suspects.any() for _, verdict in answers)
 
     def test_a_clock_beyond_a_quarter_of_a_tick_is_silence(self, decoder: Decoder) -> None:
         street, design, state = settled(decoder, 6)
@@ -431,6 +467,19 @@ def test_readings_within_their_limits_may_be_a_misfit_together() -> None:
         assert (verdict.decision, verdict.cause) == (Decision.UNDECIDED, Cause.MISFIT)
         # No reading bounds a voltage then.
         assert (np.abs(estimate.v2 - street.truth()) <= estimate.bound).all()
+
+
+def test_a_name_beside_a_misfit_says_so() -> None:
+    street, design, state = settled(no_accusation, 8)
+
+    def second(_: DecoderInput) -> tuple[DecoderAnswer, ...]:
+        return (DecoderAnswer(np.arange(12) == 2),)
+
+    lies = {j: 0.01 * (-1.0) ** j for j in range(12)} | {2: 0.05}
+    _, answers = watch(street, replace(design, decoder=second), 4, state=state, lies=lies)
+    for _, verdict in answers[1:]:
+        assert (verdict.decision, who(verdict.suspects)) == (Decision.ATTACKED, (2,))
+        assert "The other meters, taken together, still disagree" in verdict.reason
 
 
 def test_what_a_decoder_overlooks_is_not_clean() -> None:
