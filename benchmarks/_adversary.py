@@ -1,13 +1,13 @@
 """Worlds, monitors and acceptance regions of `benchmarks.adversary`.
 
-The acceptance region of the statistical core for a step of one age is
-`gridsec.planning.detectability.acceptance_region`. That of the sequential monitor is here. Other estimators
-of the registry are played with the attacks made for the sequential monitor.
+The acceptance region is that of the statistical core of `modal` for a step of one age,
+`gridsec.planning.detectability.acceptance_region`. Other estimators of the registry are played with the
+attacks made for `modal`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
@@ -16,20 +16,13 @@ import numpy as np
 
 from benchmarks._scenes import LEARN_S, LEARN_STEP_S, Model, Setting, play, site, watcher
 from feeders.model.site import Site, Snapshot, from_tables, late
-from feeders.registry import SEQUENTIAL, DesignedEstimator, design
+from feeders.registry import DesignedEstimator, design
 from feeders.simulation.scenario import START
 from gridsec.arrays import Bools, Floats, Ints
+from gridsec.estimators.front import FrontDesign
+from gridsec.estimators.front.meter_bias import Learned
 from gridsec.estimators.modal import detector
-from gridsec.estimators.modal.core import Core, CoreState
-from gridsec.estimators.sequential import SequentialDesign, SequentialState
-from gridsec.estimators.sequential.posterior import condition
-from gridsec.estimators.sequential.time_scales import (
-    Scales,
-    chi_square_limit,
-    score_limit,
-    score_rows,
-    scored,
-)
+from gridsec.estimators.modal.monitor import ModalDesign, ModalState
 from gridsec.grid.network import Power
 from gridsec.interface import Decision, Frame
 from gridsec.planning.detectability import acceptance_region
@@ -63,11 +56,6 @@ class World:
     def site(self) -> Site:
         """The feeder as its files state it."""
         return _aged(self.setting.feeder) if self.aged else site(self.setting.feeder)
-
-    @property
-    def monitor(self) -> DesignedEstimator:
-        """The sequential monitor, without commissioning of its own."""
-        return self.estimator(SEQUENTIAL)
 
     def estimator(self, name: str, step_s: float = 1.0, commission_s: float = 0.0) -> DesignedEstimator:
         """An estimator for the feeder as its files state it."""
@@ -165,92 +153,45 @@ def learning(setting: Setting) -> Iterator[Frame]:
 # --- acceptance regions -------------------------------------------------------------------------
 
 
-def scales(made: SequentialDesign, state: SequentialState) -> Scales:
-    """Scales of the sequential monitor at one moment."""
-    return Scales(made, state.uncertainty, state.window, state.learned, state.model_error)
-
-
-def sequential_region(
-    scales: Scales, *, misfit: bool = True, busbar: bool = True, levels: Sequence[float] | None = None
-) -> AcceptanceRegion:
-    """Displacements of all residuals that no test of the monitor rejects, all meters trusted.
-
-    The limit of the misfit is that of ``sqrt(m' Q m)``: with the honest part of m it is at most the sum of
-    both roots.
-
-    scales: the scales at one moment.
-    misfit, busbar: use the tests of the misfit and of the busbar's meter.
-    levels (s,): largest mean of the displacement on each scale, as a part of its largest value; None for a
-        constant displacement. A scale of level 0 does not test.
-    """
-    design, model = scales.design, scales.model
-    every = np.ones(model.size, dtype=np.bool_)
-    rows, forms = [], []
-    for s, level in enumerate([1.0] * len(design.lengths) if levels is None else levels):
-        if level <= 0.0:
-            continue
-        here = scales[s]
-        now = condition(here.prior, here.noise, every)
-        Q, std = now.Q, np.sqrt(1.0 / now.diagonal())
-        rows.append(level * Q * (std**2 / here.limits.limit(std))[:, None])
-        if misfit:
-            error, tail = np.sqrt(model @ np.abs(Q) @ model), design.tails[s]
-            if scored(design):
-                tail = 0.5 * tail
-                rows.append(
-                    level * (score_rows(design, Q) @ Q) / (score_limit(design.customers, tail) + error)
-                )
-            root = np.sqrt(chi_square_limit(model.size, tail)) + error
-            forms.append(level * np.linalg.cholesky(Q).T / root)
-        if busbar:
-            incidence = design.busbar_incidence
-            together = incidence.T @ Q
-            form = np.sqrt(np.einsum("bp,pb->b", together, incidence))
-            some = form > 0.0
-            rows.append(level * together[some] / (design.sigmas[s] * form[some])[:, None])
-    last = scales[len(design.lengths) - 1]
-    gain = condition(last.prior, last.noise, every)
-    return AcceptanceRegion(np.vstack(rows), tuple(forms), last.prior.covariance @ gain.Q)
-
-
-def honest_covariance(scales: Scales, ticks: int) -> tuple[Floats, Floats]:
+def honest_covariance(front: FrontDesign, learned: Learned, ticks: int) -> tuple[Floats, Floats]:
     """Covariance of a mean of honest residuals, (p, p), and that of the places' voltages with it, (n, p).
 
-    scales: the scales at one moment.
+    front, learned: the front end, and the known fixed errors.
     ticks: length of the mean, with all readings.
     """
-    design, prior = scales.design, scales[len(scales.design.lengths) - 1].prior
-    V = prior.between + np.diag(scales.learned.variance + design.white / ticks)
+    prior = front.prior
+    V = prior.covariance[prior.meters] + np.diag(learned.variance + front.white / ticks)
     return V, prior.covariance
 
 
-def core_region(kernel: Core, state: CoreState, age: int) -> AcceptanceRegion:
+def region(design: ModalDesign, state: ModalState, age: int) -> AcceptanceRegion:
     """Steps of a given age that the core accepts, all readings complete.
 
     Parameters
     ----------
-    kernel, state
-        The core, and its state after honest ticks.
+    design, state
+        The monitor, and its state after honest ticks.
     age
         Ticks since the onset, its own included.
     """
-    onsets = detector.followed(kernel.modes, state.detector).onsets
+    kernel = design.core
+    onsets = detector.followed(kernel.modes, state.core.detector).onsets
     rows = np.flatnonzero(onsets.used & ~onsets.ramp)
-    return acceptance_region(kernel, state, int(rows[np.argmin(np.abs(onsets.age[rows] - age))]))
+    return acceptance_region(kernel, state.core, int(rows[np.argmin(np.abs(onsets.age[rows] - age))]))
 
 
 # --- faults -------------------------------------------------------------------------------------
 
 
 def faults(
-    where: Site, made: SequentialDesign, frame: Frame, meters: Ints, *, powers: bool, busbar: bool
+    where: Site, made: FrontDesign, frame: Frame, meters: Ints, *, powers: bool, busbar: bool
 ) -> Faults:
     """Faults of a coalition at one frame.
 
     Parameters
     ----------
     where, made, frame
-        The feeder, the sequential monitor, and the last honest frame.
+        The feeder, the front end, and the last honest frame.
     meters
         Meters with false voltages.
     powers
@@ -273,7 +214,7 @@ def faults(
 
 
 def falsified(
-    frame: Frame, made: SequentialDesign, meters: Ints, amounts: Floats, *, powers: bool, busbar: bool
+    frame: Frame, made: FrontDesign, meters: Ints, amounts: Floats, *, powers: bool, busbar: bool
 ) -> Frame:
     """Frame with the faults of `faults`, in these amounts, (q,)."""
     y, p, v0 = frame.y.copy(), frame.p, frame.v0_squared

@@ -18,14 +18,13 @@ from scipy.sparse.csgraph import breadth_first_order, depth_first_order, dijkstr
 
 from feeders.format.tables import CustomerRow, FeederMeta, FeederTables, LineRow
 from feeders.model.site import Site, Snapshot, from_tables, load, unread
-from feeders.registry import SEQUENTIAL, DesignedEstimator, design
+from feeders.registry import MODAL, DesignedEstimator, design
 from feeders.simulation.demand import Variation
 from feeders.simulation.scenario import START, Scenario
 from feeders.simulation.trial import FrameTruth, LoadError, Trial, TrialMeterErrors, frames
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.attack import Attack
-from gridsec.estimators.sequential import Commission, SequentialDesign, SequentialState, init, step
-from gridsec.estimators.sequential.meter_bias import Learned
+from gridsec.estimators.front import Commission
 from gridsec.interface import Frame, PowerOrigin
 
 ONSET_S = 20.0
@@ -117,7 +116,7 @@ def watcher(
     *,
     step_s: float = 1.0,
     commission_s: float = 0.0,
-    estimator: str = SEQUENTIAL,
+    estimator: str = MODAL,
 ) -> DesignedEstimator:
     """The monitor of a feeder, by default the default one."""
     _, stated = _trial(feeder, model, step_s)
@@ -222,25 +221,24 @@ def moment(setting: Setting) -> float:
     return float(np.random.default_rng([setting.seed, 146]).uniform(0.0, PROFILE_S))
 
 
-def start(setting: Setting) -> tuple[SequentialDesign, SequentialState]:
-    """The monitor and its state before the first frame."""
-    made: SequentialDesign = watcher(setting.feeder, setting.model).design
-    known = learned(setting) if setting.learned else None
-    return made, init(made, START, known)
-
-
-def begin(setting: Setting, estimator: str) -> tuple[DesignedEstimator, Any]:
-    """An estimator that learns, and its state before the first frame."""
+def begin(setting: Setting, estimator: str = MODAL) -> tuple[DesignedEstimator, Any]:
+    """An estimator, and its state before the first frame, with learned errors if it learns."""
     made = watcher(setting.feeder, setting.model, estimator=estimator)
     learning = made.family.bias_learning
     if not setting.learned or learning is None:
         return made, made.init(START)
-    return made, learning.init(made.design, START, _commission(setting, estimator))
+    return made, learning.init(made.design, START, learned(setting, estimator))
 
 
 @lru_cache(maxsize=64)
-def _commission(setting: Setting, estimator: str) -> Commission:
-    """Knowledge of the fixed errors after the six honest hours of `learned`."""
+def learned(setting: Setting, estimator: str = MODAL) -> Commission:
+    """Fixed errors learned over the six honest hours before START, tick `LEARN_STEP_S`.
+
+    Raises
+    ------
+    RuntimeError
+        If the estimator names a meter in these hours, or does not learn.
+    """
     made = watcher(
         setting.feeder, setting.model, step_s=LEARN_STEP_S, commission_s=LEARN_S, estimator=estimator
     )
@@ -255,33 +253,6 @@ def _commission(setting: Setting, estimator: str) -> Commission:
         raise RuntimeError(f"{estimator} does not learn")
     known = learning.commission(state)
     return replace(known, learning=None)
-
-
-@lru_cache(maxsize=64)
-def learned(setting: Setting) -> Learned:
-    """Fixed errors learned over the six honest hours before START, tick `LEARN_STEP_S`.
-
-    Raises
-    ------
-    RuntimeError
-        If the monitor names a meter in these hours, or learns nothing though all powers are read.
-    """
-    return learn(setting, LEARN_STEP_S)
-
-
-def learn(setting: Setting, step_s: float) -> Learned:
-    """As `learned`, for another tick, s."""
-    made = watcher(setting.feeder, setting.model, step_s=step_s, commission_s=LEARN_S).design
-    begin = START - LEARN_S - 2.0 * step_s
-    state = init(made, begin)
-    for frame, _ in play(setting, START - begin, step_s=step_s, start=begin):
-        state, _, verdict = step(made, state, frame)
-        if verdict.suspects.any():
-            raise RuntimeError(f"{setting}: a meter is named while errors are learned")
-    # Without all powers some meters, or all, are not learned; that is the state after these hours.
-    if state.learning is not None and setting.model not in _SILENT:
-        raise RuntimeError(f"{setting}: nothing is learned")
-    return state.learned
 
 
 # --- places -------------------------------------------------------------------------------------

@@ -6,13 +6,11 @@ The truth is AC power flow with the droop inverters in closed loop; meters have 
 files, and fixed errors are learned over six hours unless stated otherwise. A coalition chooses false voltages
 (and powers, and the busbar's reading) that maximise the error of one reconstructed voltage within a share of
 every limit of the estimator: a second-order cone program (`gridsec.planning.unavoidable`) against the tests
-of `sequential`, or of `modal`. Other estimators of the registry are attacked with the programs made for
-`sequential`.
+of `modal`. Other estimators of the registry are attacked with the programs made for `modal`.
 
 Attacks, of a contiguous third of the meters unless stated otherwise:
 
-limits           a step within the limits of single meters and of the busbar's meter alone
-misfit           a step within these and the misfit of all meters
+step             a step within all limits
 ramp             the same over ten minutes
 commissioning    a step before fixed errors are learned, held for all of the six hours and after them
 restart          a step at the first tick after a restart
@@ -51,33 +49,25 @@ from benchmarks._adversary import (
     Answer,
     Registered,
     World,
-    core_region,
     falsified,
     faults,
     honest_covariance,
     learning,
-    scales,
-    sequential_region,
+    region,
 )
 from benchmarks._arguments import count
 from benchmarks._scenes import (
     Model,
     Setting,
     beyond,
-    learned,
     neighbours,
     without,
 )
 from feeders.model.site import Site, unread
-from feeders.registry import SEQUENTIAL
-from feeders.simulation.scenario import START
+from feeders.registry import MODAL
 from gridsec.arrays import Floats, Ints
-from gridsec.estimators import sequential
-from gridsec.estimators.modal.monitor import ModalDesign
-from gridsec.estimators.sequential import SequentialState
 from gridsec.interface import Decision, Frame
 from gridsec.planning.unavoidable import (
-    AcceptanceRegion,
     ConeProgram,
     blind_norm,
     deviations,
@@ -87,13 +77,13 @@ from gridsec.planning.unavoidable import (
 
 FEEDERS = ("simbench-lv-rural1", "kerber-dorfnetz", "kerber-vorstadtnetz")
 SHARES = (0.1, 0.3, 0.6, 0.8, 1.0, 1.3, 2.0)
-"""Parts of every limit: at 1, honest residuals decide; beyond, the first ticks before a mean is full."""
+"""Parts of every limit: at 1, honest residuals decide; beyond, the first ticks after the onset."""
 CALM, TICKS = 20, 120
-"""Honest ticks before an attack and ticks of an attack: twice the longest scale."""
+"""Honest ticks before an attack and ticks of an attack."""
 RAMP = 600
 """Ticks of a ramp: the correlation time of the loads."""
 WITHHELD = 75
-"""Ticks without powers before their voltages are false: the longest mean and some."""
+"""Ticks without powers before their voltages are false."""
 SPIKE = 0.1
 """Size of a spike, part of the voltage."""
 TARGETS = 2
@@ -161,8 +151,6 @@ class Kind:
         Patterns over time, by name.
     place
         Coalition: of the feeder, the meter that the prior knows least, and the seed.
-    misfit
-        The attack stays within the misfit's limit as well.
     ticks
         Length.
     powers, busbar, withheld, aged
@@ -173,7 +161,6 @@ class Kind:
 
     patterns: tuple[tuple[str, Pattern], ...] = (("step", step),)
     place: Callable[[Site, int, int], Ints] = third
-    misfit: bool = True
     ticks: int = TICKS
     powers: bool = False
     busbar: bool = False
@@ -184,8 +171,7 @@ class Kind:
 
 
 KINDS = {
-    "limits": Kind(misfit=False),
-    "misfit": Kind(),
+    "step": Kind(),
     "ramp": Kind((("600 s", ramp),), ticks=RAMP + TICKS),
     "commissioning": Kind(learned=False, calm=0),
     "restart": Kind(calm=0),
@@ -238,22 +224,23 @@ class Scene:
     def __init__(self, kind: Kind, feeder: str, seed: int, estimator: str) -> None:
         self.kind = kind
         self.world = World(Setting(feeder, Model.MATCHED, learned=True, seed=seed), kind.aged)
-        self.site, self.made = self.world.site, self.world.monitor.design
-        self.monitor = Registered(estimator, self.world)
-        known = learned(self.world.setting) if kind.learned else None
-        front = sequential.init(self.made, START, known)
-        self.before = self.monitor.start(learning(self.world.setting) if kind.learned else ())
+        self.site, self.monitor = self.world.site, Registered(estimator, self.world)
+        known = list(learning(self.world.setting)) if kind.learned else []
+        self.before = self.monitor.start(known)
+        # Its tests are those that the attack stays within.
+        self.modal = Registered(MODAL, self.world)
+        self.tests = self.modal.start(known)
+        self.made = self.modal.design.design.front
         first = int(np.argmax(self.made.prior.variance[self.made.prior.meters]))
         self.meters = kind.place(self.site, first, seed)
         self.frames = [
             (self._withheld(frame, k), v2)
             for k, (frame, v2) in enumerate(self.world.frames(float(kind.calm + kind.ticks)))
         ]
-        for k, (frame, _) in enumerate(self.frames[: max(kind.calm, CALM)]):
-            front, _, _ = sequential.step(self.made, front, frame)
-            if k < kind.calm:
-                self.before, _ = self.monitor.step(self.before, frame)
-        self.front: SequentialState = front
+        for frame, _ in self.frames[: kind.calm]:
+            self.before, _ = self.monitor.step(self.before, frame)
+        for frame, _ in self.frames:
+            self.tests, _ = self.modal.step(self.tests, frame)
         self.honest = [answer.v2 for answer in self._play(None)]
         self.faults = faults(
             self.site,
@@ -274,39 +261,26 @@ class Scene:
 
     def _minimum(self, age: int) -> tuple[Floats, float]:
         """Unavoidable errors at all places, and the factor of tests that do not know the direction."""
-        V, prior = honest_covariance(scales(self.made, self.front), age)
+        V, prior = honest_covariance(self.made, self.tests.front.learned, age)
         z = deviations(self.made.options.alarms_per_year, age * self.made.step_s)
         errors = unavoidable(V, prior, self.faults, z)
         if self.kind.powers:
             # Some combinations are nearly invisible: ranges of the powers limit them.
-            region, errors = every_test(V, prior, z), np.zeros_like(errors)
-            program, gain = ConeProgram(region, self.faults), self.faults.gain(region.weights)
+            tests, errors = every_test(V, prior, z), np.zeros_like(errors)
+            program, gain = ConeProgram(tests, self.faults), self.faults.gain(tests.weights)
             for x in np.unique(self.made.prior.meters[self.meters]):
                 errors[x] = program(gain[x]).size
         return errors, blind_norm(self.faults.signature.shape[1], z) / z
 
-    def region(self, pattern: Pattern) -> AcceptanceRegion:
-        """Accepted displacements of a pattern: by the estimator's own tests where they are known."""
-        if isinstance(self.monitor.design.design, ModalDesign):
-            state = self.before
-            for frame, _ in self.frames[self.kind.calm :]:
-                state, _ = self.monitor.step(state, frame)
-            return core_region(self.monitor.design.design.core, state.core, min(self.kind.ticks, TICKS))
-        level = np.array([pattern(age) for age in range(self.kind.ticks)])
-        sums = np.concatenate([[0.0], np.cumsum(level)])
-        ends = [np.abs(sums[n:] - sums[:-n]).max() / n for n in self.made.lengths]
-        now = scales(self.made, self.front)
-        return sequential_region(now, misfit=self.kind.misfit, levels=[float(end) for end in ends])
-
-    def attacks(self, pattern: Pattern) -> Iterator[tuple[float, Floats]]:
+    def attacks(self) -> Iterator[tuple[float, Floats]]:
         """Shares of the limits and amounts of the faults."""
         if self.kind.place is single:
             at = self.frames[self.kind.calm][0].y[self.meters]
             yield 1.0, at * ((1.0 - SPIKE) ** 2 - 1.0)
             return
         size = np.max([errors for errors, _ in self.minima], axis=0)
-        region = self.region(pattern)
-        program, gain = ConeProgram(region, self.faults), self.faults.gain(region.weights)
+        accepted = region(self.modal.design.design, self.tests, min(self.kind.ticks, TICKS))
+        program, gain = ConeProgram(accepted, self.faults), self.faults.gain(accepted.weights)
         for share in SHARES:
             found = [program(gain[x], share) for x in np.argsort(-size)[:TARGETS]]
             yield share, max(found, key=lambda one: one.size).amounts
@@ -380,7 +354,7 @@ def rows(name: str, feeder: str, seeds: int, estimator: str) -> Iterator[tuple[s
     kind = KINDS[name]
     scenes = [Scene(kind, feeder, seed, estimator) for seed in range(seeds)]
     for variant, pattern in kind.patterns:
-        plays = [scene.play(pattern, *one) for scene in scenes for one in scene.attacks(pattern)]
+        plays = [scene.play(pattern, *one) for scene in scenes for one in scene.attacks()]
         yield variant, f"{scenes[0].meters.size} of {scenes[0].site.meters.size}", plays
 
 
@@ -419,7 +393,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("seeds", nargs="?", type=count, default=1)
     parser.add_argument("attacks", nargs="*", metavar="attack")
     parser.add_argument("--feeder", action="append", help="a feeder of the project; may be repeated")
-    parser.add_argument("--estimator", default=SEQUENTIAL, help="of the registry")
+    parser.add_argument("--estimator", default=MODAL, help="of the registry")
     return parser
 
 

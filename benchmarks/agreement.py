@@ -1,6 +1,6 @@
-"""Whether the sequential monitor and the exact bank name the same meters.
+"""Agreement of the names by `modal` and by the exact bank.
 
-    python -m benchmarks.agreement [scenarios] [estimator]
+    python -m benchmarks.agreement [scenarios]
 
 Random minutes on the feeders that are small enough for the bank with M = 2 (CIGRE LV, SimBench rural 1,
 Kerber Landnetz): any time of the fourteen days, no meter, one or two meters manipulated by bias, scaling or
@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, load, to_frame
-from feeders.registry import DIRECT, SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.registry import DIRECT, DesignedEstimator, choose, design
 from feeders.simulation.attacks import NoSuchAttack
 from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
 from gridsec.interface import Verdict
@@ -78,12 +78,10 @@ def compare(
     return verdicts, {int(j) for attack in what.attacks for j in attack.meters}
 
 
-def main(count: int, estimator: str = SEQUENTIAL) -> int:
+def main(count: int) -> int:
     """Compare; 1 if one of them ever names an honest meter."""
     sites = [choose(load(name), max_attacked=2) for name in FEEDERS]
-    both = [
-        (design(choose(site, estimator=estimator)), design(choose(site, estimator=DIRECT))) for site in sites
-    ]
+    both = [(design(site), design(choose(site, estimator=DIRECT))) for site in sites]
     tally: Counter[str] = Counter()
     wrong = 0
     for seed in range(count):
@@ -111,5 +109,4 @@ def main(count: int, estimator: str = SEQUENTIAL) -> int:
 
 
 if __name__ == "__main__":
-    asked = arguments(__doc__, scenarios=1000, estimator=SEQUENTIAL)
-    sys.exit(main(asked.scenarios, asked.estimator))
+    sys.exit(main(arguments(__doc__, scenarios=1000).scenarios))

@@ -1,4 +1,4 @@
-"""A manipulated busbar meter, monitor `sequential`: names of it, and of no honest meter.
+"""A manipulated busbar meter: names of it, and of no honest meter.
 
     python -m benchmarks.busbar_lies [seeds]
 
@@ -26,7 +26,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import load
-from feeders.registry import SEQUENTIAL, choose, design
+from feeders.registry import design
 from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.trial import Trial, TrialMeterErrors, frames
 from gridsec.interface import Frame
@@ -63,7 +63,7 @@ def run(feeder: str, meters: TrialMeterErrors, percent: float, lie: AttackSpec |
     if lie is not None:
         lie = replace(lie, count=site.meters.size // 3, onset_s=float(ONSET))
     trial = Trial(site, seed, duration_s=float(TICKS), lie=lie, meters=meters)
-    watcher, state = design(choose(trial.stated, estimator=SEQUENTIAL)), None
+    watcher, state = design(trial.stated), None
     at, late, errors = site.meters, np.inf, []
     ever, liars = np.zeros(at.size, dtype=np.bool_), np.zeros(at.size, dtype=np.bool_)
     honest = np.zeros(at.size, dtype=np.bool_)

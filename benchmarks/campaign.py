@@ -3,7 +3,7 @@
     python -m benchmarks.campaign [scenes] [--full]
 
 Ten-minute scenarios at one reading per second, 16 in a scene, full AC power flow as truth, the default kinds
-of lies, watched by the sequential monitor: with one process, with two, and on a local Dask cluster of two
+of manipulations, the default estimator: with one process, with two, and on a local Dask cluster of two
 workers; the tables have to be equal. Then what 10 000 of them would take with two processes. `--full` plays
 10 000 with two processes, keeping them in campaign-10000.journal.
 """

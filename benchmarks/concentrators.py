@@ -28,7 +28,7 @@ from benchmarks._arguments import arguments
 from feeders.model.site import Site, load, load_doubt, plant, to_frame
 from feeders.simulation.scenario import Scenario, simulate, snapshots
 from gridsec.arrays import Bools, Floats
-from gridsec.estimators import distributed, sequential
+from gridsec.estimators import distributed, front
 from gridsec.estimators.distributed import (
     Area,
     AreaEstimate,
@@ -39,7 +39,7 @@ from gridsec.estimators.distributed import (
     laterals,
     verdict,
 )
-from gridsec.estimators.sequential.posterior import voltage_prior
+from gridsec.estimators.front.posterior import voltage_prior
 from gridsec.grid.radial import Feeder
 from gridsec.interface import Frame
 
@@ -86,7 +86,7 @@ class Setting:
         if not isinstance(self.site.feeder, Feeder):
             sys.exit(f"{name} is not a balanced radial feeder")
         self.feeder, self.doubt = self.site.feeder, load_doubt(self.site)
-        whole = sequential.design(plant(self.site), doubt=self.doubt, step_s=1.0)
+        whole = front.design(plant(self.site), doubt=self.doubt, step_s=1.0)
         self.noise: Floats = whole.white + whole.fixed
         accuracy = self.site.accuracy
         self.busbar = 2.0 * float(np.hypot(accuracy.busbar_class / np.sqrt(3.0), accuracy.busbar_jitter))

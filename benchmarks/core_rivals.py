@@ -146,7 +146,7 @@ class Result:
 
 def run(case: Case, feeder: str, meters: TrialMeterErrors, seed: int) -> Result:
     """One run."""
-    kernel, front = kernel_of(feeder, meters), watcher(feeder, meters).design
+    kernel, front = kernel_of(feeder, meters), watcher(feeder, meters).design.front
     world, random = World(front, seed), np.random.default_rng([seed, 5])
     lie, level = manipulation(case, kernel, seed)
     liars: Bools = lie != 0.0

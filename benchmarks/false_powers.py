@@ -26,7 +26,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, load, to_frame
-from feeders.registry import SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.registry import DesignedEstimator, choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec, NoSuchAttack, manipulations
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 
@@ -78,7 +78,7 @@ def main(seeds: int) -> None:
     """Count and print."""
     print("| feeder | lie | " + " | ".join(OUTCOMES) + " |\n|---|---|" + "---|" * len(OUTCOMES))
     for name in FEEDERS:
-        site = choose(load(name), max_attacked=MOST, estimator=SEQUENTIAL)
+        site = choose(load(name), max_attacked=MOST)
         watcher = design(site)
         for lie in LIES:
             tally: Counter[str] = Counter()

@@ -1,10 +1,8 @@
 """Cost of many feeders in one process: time by stage, rates of decoding, meters held at one reading a second.
 
     python -m benchmarks.fleet [SECONDS] [MOST] [FIRST] [OTHER_TREE] [--costs] [--workers] [--json] [--arrow]
-        [--sequential]
 
 Feeders are copies of the Kerber suburban network, 146 meters and the busbar each. All ratios are of one run.
-With --sequential the estimator of the feeders is `sequential` in place of the default.
 
 1. Stages: an engine without zenoh takes calm ticks of four feeders, as single JSON readings and as batches in
    Arrow, CBOR and JSON. Processor time of each stage, as a multiple of the estimator's step.
@@ -54,7 +52,7 @@ from benchmarks._arguments import arguments
 from benchmarks.overload import START_S, Service, free_ports, metrics, renamed, running, ticks
 from feeders.format.tables import to_json, write
 from feeders.model.site import Site, from_tables, load
-from feeders.registry import SEQUENTIAL, DesignedEstimator, choose
+from feeders.registry import DesignedEstimator
 from feeders.simulation.plant import BUSBAR
 from feeders.simulation.scenario import Scenario, SimulatedReading, simulate
 from service.cli.simulate import key_of
@@ -618,9 +616,9 @@ TICK_MAX, SINGLES_MIN, BATCHES_MIN = 3.0, 0.2, 1e5
 
 def main() -> int:
     """Measure."""
-    options = dict.fromkeys(("costs", "workers", "json", "arrow", "sequential"), False)
+    options = dict.fromkeys(("costs", "workers", "json", "arrow"), False)
     asked = arguments(__doc__, seconds=20.0, most=200, first=FIRST, against="", **options)
-    site = choose(load(FEEDER), estimator=SEQUENTIAL if asked.sequential else None)
+    site = load(FEEDER)
     if asked.against:
         print_against(site, asked.seconds, Path(asked.against).resolve())
         return 0

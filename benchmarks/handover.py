@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, load
-from feeders.registry import MODAL, SEQUENTIAL, choose
 from feeders.simulation.scenario import Scenario, SimulatedReading, by_arrival, simulate
 from gridsec.interface import Decision
 from service.cli.simulate import key_of, payload_of
@@ -29,22 +28,21 @@ START, FIRST_S, WATCHED_S = 1_795_212_000.0, 30.0, 14.0
 def main() -> None:
     """Measure, and print a table."""
     given = arguments(__doc__, kills=6, feeder="cigre-lv")
-    print("| estimator | gap, s | ticks until CLEAN with the stored observer | without |\n|---|---|---|---|")
-    for name in (SEQUENTIAL, MODAL):
-        site = choose(load(given.feeder), estimator=name)
-        scenario = Scenario(seed=4, start=START, duration_s=FIRST_S + 3.0 * given.kills + 20.0)
-        recorded = list(by_arrival(simulate(site, scenario)))
-        kills = [START + FIRST_S + 3.0 * k for k in range(given.kills)]
-        stored = [_stored(site, [one for one in recorded if one.t <= kill]) for kill in kills]
-        for gap_s in (2.0, 3.0, 4.0):
-            cells = []
-            for resumed in (True, False):
-                ticks = [
-                    _until_clean(site, recorded, kill + gap_s, kept if resumed else None)
-                    for kill, kept in zip(kills, stored, strict=True)
-                ]
-                cells.append(f"{min(ticks)} to {max(ticks)}")
-            print(f"| `{name}` | {gap_s:.0f} | {' | '.join(cells)} |", flush=True)
+    print("| gap, s | ticks until CLEAN with the stored observer | without |\n|---|---|---|")
+    site = load(given.feeder)
+    scenario = Scenario(seed=4, start=START, duration_s=FIRST_S + 3.0 * given.kills + 20.0)
+    recorded = list(by_arrival(simulate(site, scenario)))
+    kills = [START + FIRST_S + 3.0 * k for k in range(given.kills)]
+    stored = [_stored(site, [one for one in recorded if one.t <= kill]) for kill in kills]
+    for gap_s in (2.0, 3.0, 4.0):
+        cells = []
+        for resumed in (True, False):
+            ticks = [
+                _until_clean(site, recorded, kill + gap_s, kept if resumed else None)
+                for kill, kept in zip(kills, stored, strict=True)
+            ]
+            cells.append(f"{min(ticks)} to {max(ticks)}")
+        print(f"| {gap_s:.0f} | {' | '.join(cells)} |", flush=True)
 
 
 def _stored(site: Site, recorded: Sequence[SimulatedReading]) -> StateSnapshot | None:

@@ -1,14 +1,13 @@
-"""Errors of the honest voltages by `sequential` and `modal`, with lines that are longer than in the files.
+"""Errors of the honest voltages, with lines that are longer than in the files.
 
     python -m benchmarks.honest_errors [runs] [feeder ...]
 
 AC power flow on a feeder with lines `LONGER` times as long as in the files, designs for those of the files.
-No manipulation, one frame in `STEP_S`, errors of powers and meters as the files say. Both estimators have the
-same frames and no learned errors.
+No manipulation, one frame in `STEP_S`, errors of powers and meters as the files say, no learned errors.
 
-Columns: root mean square error of all customers' voltages after `SETTLING` frames, mV, and the ratio of
-`modal` to `sequential`; root mean square of the errors over their stated standard deviations; those
-frames that are not CLEAN, and honest meters that are named.
+Columns: root mean square error of all customers' voltages after `SETTLING` frames, mV; root mean square of
+the errors over their stated standard deviations; those frames that are not CLEAN, and honest meters that are
+named.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from benchmarks._arguments import arguments
 from benchmarks.limits import head, row, unlearned
 from feeders.model.site import Site, from_tables, load
 from feeders.model.site import names as library
-from feeders.registry import MODAL, SEQUENTIAL, DesignedEstimator
+from feeders.registry import DesignedEstimator
 from feeders.simulation.trial import Trial, TrialMeterErrors, frames
 from feeders.studies.calibrate.search import longer
 from gridsec.arrays import Floats
@@ -41,7 +40,7 @@ STEP_S, FRAMES, SETTLING = 5.0, 240, 60
 
 @dataclass(slots=True)
 class Errors:
-    """Squared errors of one estimator, their ratios to the stated variances, and wrong answers."""
+    """Squared errors, their ratios to the stated variances, and wrong answers."""
 
     squares: list[Floats] = field(default_factory=list)
     ratios: list[Floats] = field(default_factory=list)
@@ -54,23 +53,22 @@ class Errors:
         return float(np.sqrt(np.mean(self.squares))), float(np.sqrt(np.mean(self.ratios)))
 
 
-def errors(where: Site, factor: float, seed: int, into: dict[str, tuple[DesignedEstimator, Errors]]) -> None:
-    """Add the errors of one run by each estimator."""
+def errors(where: Site, factor: float, seed: int, made: DesignedEstimator, out: Errors) -> None:
+    """Add the errors of one run."""
     lines = tuple(longer(line, factor) for line in where.tables.lines)
     truth = from_tables(replace(where.tables, lines=lines))
     played = list(frames(replace(trial(truth), seed=seed)))
     volt = where.customer_volt
-    for made, out in into.values():
-        state = made.init(played[0][0].t)
-        for k, (frame, exact) in enumerate(played):
-            state, estimate, verdict = made.step(state, frame)
-            if k < SETTLING:
-                continue
-            apart = estimate.v2 - exact.v2
-            out.squares.append((volt * 0.5 * apart / np.sqrt(exact.v2)) ** 2)
-            out.ratios.append((apart / estimate.std) ** 2)
-            out.not_clean += verdict.decision is not Decision.CLEAN
-            out.named += int(verdict.suspects.sum())
+    state = made.init(played[0][0].t)
+    for k, (frame, exact) in enumerate(played):
+        state, estimate, verdict = made.step(state, frame)
+        if k < SETTLING:
+            continue
+        apart = estimate.v2 - exact.v2
+        out.squares.append((volt * 0.5 * apart / np.sqrt(exact.v2)) ** 2)
+        out.ratios.append((apart / estimate.std) ** 2)
+        out.not_clean += verdict.decision is not Decision.CLEAN
+        out.named += int(verdict.suspects.sum())
 
 
 def trial(where: Site) -> Trial:
@@ -82,30 +80,16 @@ def trial(where: Site) -> Trial:
 
 def main(runs: int, names: tuple[str, ...]) -> None:
     """One table."""
-    head(
-        "feeder",
-        "lines",
-        "error, mV",
-        "`modal`",
-        "ratio",
-        "over std",
-        "`modal`",
-        "not CLEAN, named",
-        "`modal`",
-    )
+    head("feeder", "lines", "error, mV", "over std", "not CLEAN", "named")
     for name in names:
         where = load(name)
-        stated = trial(where).stated
-        made = {estimator: unlearned(stated, estimator) for estimator in (SEQUENTIAL, MODAL)}
+        made = unlearned(trial(where).stated)
         for factor in LONGER:
-            found = {estimator: (one, Errors()) for estimator, one in made.items()}
+            found = Errors()
             for seed in range(runs):
-                errors(where, factor, seed, found)
-            now, new = found[SEQUENTIAL][1], found[MODAL][1]
-            volts = [f"{1e3 * one.rms[0]:.0f}" for one in (now, new)]
-            ratios = [f"{one.rms[1]:.2f}" for one in (now, new)]
-            counts = [f"{one.not_clean}, {one.named}" for one in (now, new)]
-            row(name, f"{factor:g}", *volts, f"{new.rms[0] / now.rms[0]:.2f}", *ratios, *counts)
+                errors(where, factor, seed, made, found)
+            volt, ratio = found.rms
+            row(name, f"{factor:g}", f"{1e3 * volt:.0f}", f"{ratio:.2f}", found.not_clean, found.named)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What the sequential monitor makes of manipulations, counted. Run `python -m benchmarks.kinds`.
+"""Kinds that the default estimator gives to manipulations, counted. Run `python -m benchmarks.kinds`.
 
 Every line is one kind of attack on one feeder, AC power flow with the droop inverters as the truth, one
 reading per second, the meters' promised errors: how many lying meters were named, how long that took, and
@@ -15,12 +15,12 @@ from time import process_time
 import numpy as np
 
 from feeders.model.site import Site, load, to_frame
-from feeders.registry import SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.registry import DesignedEstimator, design
 from feeders.simulation.attacks import NoSuchAttack
 from feeders.simulation.plant import MeterErrors
 from feeders.simulation.scenario import START, Scenario, random_attacks, simulate, snapshots
 from gridsec.attack import Attack, Replay
-from gridsec.estimators.sequential import attack_kind
+from gridsec.estimators.front import attack_kind
 
 # Attack, number of liars, size in pu, begin and end in s. A clock's error is a replay since ever.
 ATTACKS: tuple[tuple[str, int, float, float, float], ...] = (
@@ -77,7 +77,7 @@ def watch(site: Site, watcher: DesignedEstimator, scenario: Scenario) -> Seen:
 
 def told(name: str, kind: str, seeds: Iterable[int]) -> str:
     """One line of the table."""
-    site = choose(load(name), estimator=SEQUENTIAL)
+    site = load(name)
     watcher = design(site)
     liars, called, honest = 0, Counter[str](), 0
     delays: list[float] = []
@@ -101,7 +101,7 @@ def told(name: str, kind: str, seeds: Iterable[int]) -> str:
 
 def clean(name: str, hours: float, seeds: Iterable[int], errors: MeterErrors, profile_s: float) -> str:
     """Honest meters: how many were ever named, or repeated themselves beyond chance."""
-    site = choose(load(name), estimator=SEQUENTIAL)
+    site = load(name)
     watcher = design(site)
     runs = [
         watch(
@@ -119,8 +119,8 @@ def clean(name: str, hours: float, seeds: Iterable[int], errors: MeterErrors, pr
 
 def cost(name: str, ticks: int = 4200) -> str:
     """What listening and describing cost per tick once the memory is full."""
-    watcher = design(choose(load(name), estimator=SEQUENTIAL))
-    shapes, random = watcher.design.references, np.random.default_rng(0)
+    watcher = design(load(name))
+    shapes, random = watcher.design.front.references, np.random.default_rng(0)
     p = shapes.limits.step.size
     live, none, state, times = np.ones(p, np.bool_), np.zeros(p, np.bool_), attack_kind.no_kinds(p), []
     for k in range(ticks):

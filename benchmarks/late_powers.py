@@ -1,7 +1,7 @@
 """Powers that are older than the voltages beside them, with kettles and charging cars, and no manipulation.
 
-    python -m benchmarks.late_powers [runs] [minutes] [estimator]
-    python -m benchmarks.late_powers [runs] [minutes] [estimator] --unchanged
+    python -m benchmarks.late_powers [runs] [minutes]
+    python -m benchmarks.late_powers [runs] [minutes] --unchanged
 
 Kerber Dorfnetz without inverters, one reading per second, AC power flow as the truth. Every household
 switches a kettle of 2 kW for 150 s, every ten minutes on average; every fifth customer, with a connection of
@@ -38,7 +38,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import PowerAges, Site, Snapshot, from_tables, load, to_frame
-from feeders.registry import SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.registry import DesignedEstimator, design
 from feeders.simulation.demand import Customers, Variation
 from feeders.simulation.powerflow import PowerFlow
 from feeders.simulation.scenario import START
@@ -91,9 +91,9 @@ def site(interval_s: float) -> Site:
 
 
 @lru_cache(maxsize=4)
-def watcher(interval_s: float, estimator: str = SEQUENTIAL) -> DesignedEstimator:
-    """A monitor of that feeder."""
-    return design(choose(site(interval_s), estimator=estimator))
+def watcher(interval_s: float) -> DesignedEstimator:
+    """The monitor of that feeder."""
+    return design(site(interval_s))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,9 +161,7 @@ def ages(seed: int, how: str, ticks: int, count: int) -> Floats:
     return np.full((ticks, count), LATE_S if how == "late" else 0.0)
 
 
-def run(
-    seed: int, duration_s: int, how: str, stated: str, estimator: str = SEQUENTIAL
-) -> tuple[Counter[str], float, float]:
+def run(seed: int, duration_s: int, how: str, stated: str) -> tuple[Counter[str], float, float]:
     """Counts of one run, and its largest error over the standard deviation and over the bound.
 
     Parameters
@@ -172,13 +170,11 @@ def run(
         As in `world`.
     how, stated
         Ages of the powers, and the place that states them.
-    estimator
-        A name of the registry.
     """
     interval = LATE_S if stated == "p_interval_s" else 0.0
     where, made, truth = (
         site(interval),
-        watcher(interval, estimator),
+        watcher(interval),
         world(seed, duration_s, rise_s=RISE_S * (how == "rising")),
     )
     age, random = ages(seed, how, truth.t.size, truth.v.shape[1]), np.random.default_rng([seed, 62])
@@ -214,9 +210,7 @@ def run(
     return seen, of_std, of_bound
 
 
-def unchanged(
-    seed: int, duration_s: int, kind: str, count: int, estimator: str = SEQUENTIAL
-) -> tuple[Counter[str], float, float]:
+def unchanged(seed: int, duration_s: int, kind: str, count: int) -> tuple[Counter[str], float, float]:
     """Counts of a run with unchanged powers; its largest error over the standard deviation and the bound.
 
     Parameters
@@ -225,10 +219,8 @@ def unchanged(
         As in `world`.
     kind, count
         "empty" or "stuck", and the number of its customers.
-    estimator
-        A name of the registry.
     """
-    where, made, truth = site(LATE_S), watcher(LATE_S, estimator), world(seed, duration_s)
+    where, made, truth = site(LATE_S), watcher(LATE_S), world(seed, duration_s)
     customers = truth.v.shape[1]
     which = np.random.default_rng([seed, 63]).permutation(customers)[:count]
     age, ages_of, state = ages(seed, "held", truth.t.size, customers), PowerAges(where), made.init(START)
@@ -249,7 +241,7 @@ def unchanged(
     return seen, of_std, of_bound
 
 
-def without_change(runs: int, minutes: int, estimator: str) -> int:
+def without_change(runs: int, minutes: int) -> int:
     """Print the table of unchanged powers; 1 if a limit is missed."""
     print(
         "| unchanged | customers | runs | honest named | CLEAN % | UNDECIDED % | in std | in bounds |\n|",
@@ -260,7 +252,7 @@ def without_change(runs: int, minutes: int, estimator: str) -> int:
     for kind, count in UNCHANGED:
         all_, of_std, of_bound = Counter[str](), 0.0, 0.0
         for seed in range(runs):
-            seen, std, bound = unchanged(seed, 60 * minutes, kind, count, estimator)
+            seen, std, bound = unchanged(seed, 60 * minutes, kind, count)
             all_ += seen
             of_std, of_bound = max(of_std, std), max(of_bound, bound)
         ticks = runs * minutes * 60
@@ -272,7 +264,7 @@ def without_change(runs: int, minutes: int, estimator: str) -> int:
     return 0 if good else 1
 
 
-def main(runs: int, minutes: int, estimator: str) -> int:
+def main(runs: int, minutes: int) -> int:
     """Print a table; 1 if a limit is missed."""
     print(
         "| powers | stated | runs | with honest named | honest named | CLEAN % | UNDECIDED % | ATTACKED % |",
@@ -283,7 +275,7 @@ def main(runs: int, minutes: int, estimator: str) -> int:
     for how, stated in CASES:
         all_, of_std, of_bound = Counter[str](), 0.0, 0.0
         for seed in range(runs):
-            seen, std, bound = run(seed, 60 * minutes, how, stated, estimator)
+            seen, std, bound = run(seed, 60 * minutes, how, stated)
             all_ += seen
             of_std, of_bound = max(of_std, std), max(of_bound, bound)
         share = [f"{100.0 * all_[each] / all_['ticks']:.1f}" for each in Decision]
@@ -296,5 +288,5 @@ def main(runs: int, minutes: int, estimator: str) -> int:
 
 
 if __name__ == "__main__":
-    asked = arguments(__doc__, runs=20, minutes=10, estimator=SEQUENTIAL, unchanged=False)
-    sys.exit((without_change if asked.unchanged else main)(asked.runs, asked.minutes, asked.estimator))
+    asked = arguments(__doc__, runs=20, minutes=10, unchanged=False)
+    sys.exit((without_change if asked.unchanged else main)(asked.runs, asked.minutes))

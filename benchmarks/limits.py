@@ -1,4 +1,4 @@
-"""Sequential monitor and modal core against the limits of detection and estimation, as tables in Markdown.
+"""Estimator `modal` and its core against the limits of detection and estimation, as tables in Markdown.
 
     python -m benchmarks.limits [runs] [feeder ...]
 
@@ -7,11 +7,11 @@ known to 0.6 kW and 0.2 kvar with a correlation time of 600 s, no inverters, one
 alarm a year. The first 180 ticks are honest but where stated.
 
 Delays: one random meter is off by a constant part of the voltage; also with meters of class 0.5 % after 10
-and 3 600 honest ticks, where the sequential monitor does not learn fixed errors. Ticks from the onset, its
-own included, to the first answer that is not CLEAN and to the first tick at which exactly this meter is
-named, means of the runs. Lorden: the least n with ``F_n f^2 / 2 >= log gamma``, F_n: the information after n
-ticks. CUSUM: the largest likelihood ratio over all onsets for the true meter and size, against ``log gamma``.
-GLR: that over all onsets and the p meters for the true size, against ``log (p gamma)``: the run lengths of
+and 3 600 honest ticks. Ticks from the onset, its own included, to the first answer that is not CLEAN and to
+the first tick at which exactly this meter is named, means of the runs. Lorden: the least n with
+``F_n f^2 / 2 >= log gamma``, F_n: the information after n ticks. CUSUM: the largest likelihood ratio over all
+onsets for the true meter and size, against ``log gamma``. GLR: that over all onsets and the p meters for the
+true size, against ``log (p gamma)``: the run lengths of
 both to a false alarm are at least gamma, as that of `modal`. Ratio: named by `modal` over GLR.
 
 Liars: a third of the meters, random, with random signs or alike, or contiguous and alike, 60 ticks long.
@@ -26,8 +26,8 @@ with the weights and the prior size of the core, steps of the true meter only. I
 knowing the meter and the size; the core's alarm also pays for its approximations.
 
 Honest: AC power flow, meters of class 0.5 % with 0.1 V and 0.05 %. Root mean square error of all customers'
-voltages, and of the error over its stated standard deviation. Cost: mean of a calm step in the same run; the
-core's includes no front end.
+voltages, and of the error over its stated standard deviation; the largest log M of the core, and the mean of
+a calm step, ms.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ from feeders.model.site import Site, from_tables, load
 from feeders.registry import DesignedEstimator, design
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, frames
 from gridsec.arrays import Bools, Floats, Ints
+from gridsec.estimators.front import FrontDesign
 from gridsec.estimators.modal import core, detector, estimate, full, signatures, static
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.core import Core
 from gridsec.estimators.modal.costs import SearchProblem
 from gridsec.estimators.modal.estimate import Estimated
 from gridsec.estimators.modal.search import Identification
-from gridsec.estimators.sequential import SequentialDesign
 from gridsec.interface import Decision, Frame
 
 QUIET, WATCHED = 180, 120
@@ -84,31 +84,30 @@ VOLT = 230.0
 
 @lru_cache(maxsize=8)
 def site(feeder: str) -> Site:
-    """A feeder without inverters: their observers are the same for both."""
+    """A feeder without inverters: the model of the residuals is exact."""
     tables = load(feeder).tables
     rows = tuple(replace(row, inverter_kva=0.0, droop="") for row in tables.customers)
     return from_tables(replace(tables, customers=rows))
 
 
 @lru_cache(maxsize=8)
-def watcher(feeder: str, meters: TrialMeterErrors, estimator: str = "sequential") -> DesignedEstimator:
-    """A monitor of a feeder; `sequential` does not learn fixed errors."""
-    return unlearned(Trial(site(feeder), meters=meters).stated, estimator)
+def watcher(feeder: str, meters: TrialMeterErrors) -> DesignedEstimator:
+    """The monitor of a feeder."""
+    return unlearned(Trial(site(feeder), meters=meters).stated)
 
 
-def unlearned(stated: Site, estimator: str) -> DesignedEstimator:
-    """A monitor of a feeder without commissioning."""
+def unlearned(stated: Site) -> DesignedEstimator:
+    """The monitor of a feeder without commissioning."""
     meta = stated.tables.meta
-    settings = replace(meta.monitor, commission_s=0.0, estimator=estimator)
+    settings = replace(meta.monitor, commission_s=0.0)
     return design(from_tables(replace(stated.tables, meta=replace(meta, monitor=settings))))
 
 
 @lru_cache(maxsize=8)
 def kernel_of(feeder: str, meters: TrialMeterErrors) -> Core:
-    """The core beside `watcher`, with the connections of the files."""
-    where = site(feeder)
-    kw = np.array([max(row.load_kw, row.pv_kw) for row in where.tables.customers])
-    return core.design(watcher(feeder, meters).design, kw / where.feeder.base_kva)
+    """The core of `watcher`."""
+    kernel: Core = watcher(feeder, meters).design.core
+    return kernel
 
 
 class World:
@@ -117,12 +116,12 @@ class World:
     Parameters
     ----------
     front
-        Design of the sequential monitor.
+        Design of the front end.
     seed
         Chooses everything random.
     """
 
-    def __init__(self, front: SequentialDesign, seed: int) -> None:
+    def __init__(self, front: FrontDesign, seed: int) -> None:
         self.front, self.random, self.k = front, np.random.default_rng([seed, 9]), 0
         count = front.customers
         self.effects = front.sensitivities.numbered(np.arange(2 * count))
@@ -169,18 +168,16 @@ class Delays:
 
     cusum: float
     glr: float
-    clean_now: float
-    named_now: float
-    clean_new: float
-    named_new: float
+    clean: float
+    named: float
 
 
-def delay(made: DesignedEstimator, new: DesignedEstimator, part: float, seed: int, quiet: int) -> Delays:
+def delay(made: DesignedEstimator, part: float, seed: int, quiet: int) -> Delays:
     """One step of one meter after `quiet` honest ticks."""
-    world, f, kernel = World(made.design, seed), squared(part), new.design.core
+    world, f, kernel = World(made.design.front, seed), squared(part), made.design.core
     p = kernel.modes.size
     liar = int(np.random.default_rng([seed, 1]).integers(p))
-    state, mine = made.init(0.0), new.init(0.0)
+    state = made.init(0.0)
     sized, out = KnownSize(kernel, f), dict.fromkeys(Delays.__annotations__, np.nan)
     lie = np.where(np.arange(p) == liar, f, 0.0)
 
@@ -192,15 +189,13 @@ def delay(made: DesignedEstimator, new: DesignedEstimator, part: float, seed: in
         on = k >= quiet
         frame, m, _ = world.tick(lie if on else 0.0)
         state, _, verdict = made.step(state, frame)
-        mine, _, answer = new.step(mine, frame)
         levels = sized.tick(float(k), m) if k >= quiet - 10 else sized.wait(float(k), m)
         if not on:
             continue
         first("cusum", levels[liar] >= kernel.limit, k)
         first("glr", levels.max() >= kernel.limit + log(p), k)
-        for name, one in (("now", verdict), ("new", answer)):
-            first(f"clean_{name}", one.decision is not Decision.CLEAN, k)
-            first(f"named_{name}", bool(one.suspects[liar]) and int(one.suspects.sum()) == 1, k)
+        first("clean", verdict.decision is not Decision.CLEAN, k)
+        first("named", bool(verdict.suspects[liar]) and int(verdict.suspects.sum()) == 1, k)
         if not np.isnan(list(out.values())).any():
             break
     return Delays(**out)
@@ -272,19 +267,19 @@ def third(kernel: Core, kind: str, part: float, seed: int) -> Floats:
 class Third:
     """Result of one run with a third of the meters manipulated."""
 
-    named_now: int
-    honest_now: int
-    named_new: int
-    honest_new: int
-    error_now: float
-    error_new: float
+    named: int
+    honest: int
+    named_core: int
+    honest_core: int
+    error: float
+    error_core: float
     error_known: float
     bound: float
 
 
 def attacked(made: DesignedEstimator, kernel: Core, kind: str, part: float, seed: int) -> Third:
     """One run."""
-    world, lie = World(made.design, seed), third(kernel, kind, part, seed)
+    world, lie = World(made.design.front, seed), third(kernel, kind, part, seed)
     state, mine, liars = made.init(0.0), core.init(kernel, 0.0), lie != 0.0
     at, known = kernel.model.meters[liars], Support(kernel, liars)
     found, named = None, np.zeros(liars.size, dtype=np.bool_)
@@ -375,7 +370,8 @@ class Gaps:
 def gaps(made: DesignedEstimator, kernel: Core, pattern: str, seed: int) -> Gaps:
     """One honest run, and one with a step of 0.5 % at one meter that reports."""
     p, random = kernel.modes.size, np.random.default_rng([seed, 77])
-    seen, world, mine = present(pattern, p, GAPS, random), World(made.design, seed), core.init(kernel, 0.0)
+    seen, world = present(pattern, p, GAPS, random), World(made.design.front, seed)
+    mine = core.init(kernel, 0.0)
     most, took, within = -np.inf, 0.0, list[float]()
     there = kernel.model.variance > 1e-3 * kernel.model.variance.max()
     for k in range(GAPS):
@@ -394,7 +390,7 @@ def gaps(made: DesignedEstimator, kernel: Core, pattern: str, seed: int) -> Gaps
 
 def _gap_delays(made: DesignedEstimator, kernel: Core, seen: Bools, seed: int) -> list[float]:
     """Ticks to the limit by the CUSUM and by the mixture, to the alarm and to the name; NaN for never."""
-    world, mine, out = World(made.design, seed + 1000), core.init(kernel, 0.0), [np.nan] * 4
+    world, mine, out = World(made.design.front, seed + 1000), core.init(kernel, 0.0), [np.nan] * 4
     liar, f = (
         int(np.random.default_rng(seed).choice(np.flatnonzero(seen[QUIET:].any(axis=0)))),
         squared(0.005),
@@ -425,59 +421,34 @@ def _gap_delays(made: DesignedEstimator, kernel: Core, seen: Bools, seed: int) -
 
 @dataclass
 class Honest:
-    """Result of one honest run: errors in mV, ratios to the stated deviation, and mean steps in ms."""
+    """Result of one honest run: error in mV, ratio to the stated deviation, mean step in ms, log M."""
 
-    error_now: float
-    error_new: float
-    ratio_now: float
-    ratio_new: float
-    step_now: float
-    step_new: float
+    error: float
+    ratio: float
+    step: float
     most: float
 
 
 def honest(feeder: str, seed: int, ticks: int = 240) -> Honest:
-    """AC power flow as the truth; the core beside the sequential monitor."""
+    """AC power flow as the truth."""
     trial = Trial(
         site(feeder), seed=seed, duration_s=float(ticks), meters=TrialMeterErrors.REAL, load_error=LoadError()
     )
     made = watcher(feeder, TrialMeterErrors.REAL)
-    front: SequentialDesign = made.design
-    kernel = kernel_of(feeder, TrialMeterErrors.REAL)
-    state, mine, most = None, None, -np.inf
-    errors: list[Floats] = []
-    took: list[tuple[float, float]] = []
-    customers = front.plant.feeder.bus
+    state, most, took = None, -np.inf, list[float]()
+    squares: list[tuple[float, float]] = []
     for k, (frame, truth) in enumerate(_played(trial)):
-        if state is None or mine is None:
-            state, mine = made.init(frame.t), core.init(kernel, frame.t)
+        state = made.init(frame.t) if state is None else state
         begun = time.thread_time()
         state, answer, _ = made.step(state, frame)
-        between = time.thread_time()
-        m, seen = core.residuals(state)
-        again = time.thread_time()
-        mine, evidence = core.step(kernel, mine, frame.t, m, seen)
-        took.append((between - begun, time.thread_time() - again))
+        took.append(time.thread_time() - begun)
         if k < ticks // 4:
             continue
-        most = max(most, evidence.log_m)
-        now = core.estimate(kernel, mine)
-        feeder_model = front.plant.feeder.bus_voltages(frame.p, frame.q, state.v0_squared, steps=1)
-        new = (feeder_model + now.mean)[customers] - truth.v2
-        old = answer.v2 - truth.v2
-        errors.append(
-            np.array(
-                [
-                    np.mean(old**2),
-                    np.mean(new**2),
-                    np.mean((old / answer.std) ** 2),
-                    np.mean(new**2 / now.variance[customers]),
-                ]
-            )
-        )
-    root = np.sqrt(np.mean(errors, axis=0))
-    steps = 1e3 * np.mean(took[ticks // 4 :], axis=0)
-    return Honest(*(root[:2] * 0.5 * VOLT * 1e3).tolist(), *root[2:].tolist(), *steps.tolist(), most)
+        most = max(most, state.core.detector.log_m)
+        error = answer.v2 - truth.v2
+        squares.append((float(np.mean(error**2)), float(np.mean((error / answer.std) ** 2))))
+    root = np.sqrt(np.mean(squares, axis=0))
+    return Honest(root[0] * 0.5 * VOLT * 1e3, root[1], 1e3 * float(np.mean(took[ticks // 4 :])), most)
 
 
 def _played(trial: Trial) -> Iterator[tuple[Frame, object]]:
@@ -505,16 +476,16 @@ def mean(values: list[float]) -> str:
 
 def delays(runs: int, names: tuple[str, ...]) -> None:
     """Table of delays."""
-    answers = ("not CLEAN", "named", "`modal` not CLEAN", "named", "ratio")
+    answers = ("not CLEAN", "named", "ratio")
     head("feeder, meters", "errors", "step, %", "Lorden", "CUSUM", "GLR", *answers)
     for feeder, (words, meters, quiet) in product(names, SCENES):
-        made, new = watcher(feeder, meters), watcher(feeder, meters, "modal")
-        kernel = new.design.core
+        made = watcher(feeder, meters)
+        kernel = made.design.core
         for part in STEPS:
-            each = [delay(made, new, part, seed, quiet) for seed in range(runs)]
+            each = [delay(made, part, seed, quiet) for seed in range(runs)]
             cells = [mean([getattr(one, name) for one in each]) for name in Delays.__annotations__]
             least = f"{lorden(kernel, part, quiet):.1f}"
-            both = [(one.named_new, one.glr) for one in each if not np.isnan(one.named_new + one.glr)]
+            both = [(one.named, one.glr) for one in each if not np.isnan(one.named + one.glr)]
             ratio = np.divide(*np.sum(both, axis=0)) if both else np.nan
             row(f"{feeder}, {kernel.modes.size}", words, f"{100 * part:g}", least, *cells, f"{ratio:.2f}")
 
@@ -559,22 +530,13 @@ def main(runs: int, names: tuple[str, ...]) -> None:
             cells = [f"{np.mean([getattr(one, name) for one in runs_]):.3f}" for name in ("covered", "step")]
             cells += [mean([getattr(one, name) for one in runs_]) for name in names_]
             row(feeder, pattern, f"{worst:.1f} < {kernel.limit:.1f}", *cells)
-    head(
-        "feeder",
-        "error, mV",
-        "core, mV",
-        "over std",
-        "core over std",
-        "step, ms",
-        "core, ms",
-        "ratio",
-        "log M",
-    )
+    head("feeder", "error, mV", "over std", "step, ms", "log M")
     for feeder in names:
         found = [honest(feeder, seed) for seed in range(max(1, runs // 4))]
-        texts = [f"{np.mean([getattr(one, name) for one in found]):.2f}" for name in Honest.__annotations__]
-        ratio = np.mean([one.step_new / one.step_now for one in found])
-        row(feeder, *texts[:6], f"{ratio:.2f}", f"{max(one.most for one in found):.1f} < {log(3.16e7):.1f}")
+        means = [
+            f"{np.mean([getattr(one, name) for one in found]):.2f}" for name in ("error", "ratio", "step")
+        ]
+        row(feeder, *means, f"{max(one.most for one in found):.1f} < {log(3.16e7):.1f}")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ drawn up to the size in the second column: nothing that is false fits together. 
 meters of class 0.5, loads known to 0.3 kW and 0.1 kvar (standard deviation) otherwise, one reading a second;
 the lie begins after 20 s and lasts for 40. Counted are liars named at the end, honest meters named at any
 time, ticks of the lie without the verdict ATTACKED, and the error of the reconstructed voltages at the liars,
-in per cent of nominal and in the standard deviations that the monitor `sequential` gives (95th percentiles).
+in per cent of nominal and in its stated standard deviations (95th percentiles).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import load
-from feeders.registry import SEQUENTIAL, choose, design
+from feeders.registry import design
 from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.scenario import START
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, frames
@@ -68,7 +68,7 @@ def play(feeder: str, size_kw: float, seed: int) -> Run:
         meters=TrialMeterErrors.REAL,
         lie=lie,
     )
-    watcher = design(choose(trial.stated, estimator=SEQUENTIAL))
+    watcher = design(trial.stated)
     state = watcher.init(START)
     false = np.random.default_rng(seed).uniform(-1.0, 1.0, at.size) * size_kw / site.feeder.base_kva
     accused, undecided, error, ratio = np.zeros(at.size, dtype=np.bool_), 0, [], []

@@ -1,6 +1,6 @@
 """Feeders with closed ties: the model against the AC power flow, and a third of the meters lying.
 
-The monitor is `sequential`.
+The monitor is the default one.
 
 `python -m benchmarks.mesh`; the numbers of docs/theory-mesh.md. Half a minute.
 """
@@ -19,7 +19,7 @@ import numpy as np
 
 from feeders.format.tables import FeederTables, LineRow
 from feeders.model.site import Site, from_tables, load
-from feeders.registry import SEQUENTIAL, choose, design
+from feeders.registry import design
 from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.powerflow import power_flow
 from feeders.simulation.trial import LoadError, Trial, TrialResult, judge
@@ -124,8 +124,8 @@ def sensitivity(site: Site, part: float) -> str:
 
 
 def judged(trial: Trial) -> TrialResult:
-    """Verdicts of `sequential` on one trial."""
-    return judge(design(choose(trial.stated, estimator=SEQUENTIAL)), trial, settling_s=3.0)
+    """Verdicts of the default estimator on one trial."""
+    return judge(design(trial.stated), trial, settling_s=3.0)
 
 
 def named(site: Site, trick: AttackKind, percent: float) -> str:

@@ -3,7 +3,7 @@
     python -m benchmarks.missing_powers [seeds] [feeder ...]
 
 Some meters report voltages without powers from the twentieth second on. Their voltages are true, or off by
-the largest constant within 70 % of every limit and of the misfit's room (`benchmarks._stealthy`), from the
+the largest step within 70 % of every limit of the core (`gridsec.planning.unavoidable`), from the
 ninety-fifth second on, for sixty seconds. All other readings are true; the truth is AC power flow.
 
 `unread`: the frame states the missing powers (`Frame.p_origin`). `interval only`: the frame states the same
@@ -27,14 +27,15 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-from benchmarks import _stealthy
+from benchmarks._adversary import LARGEST, region
 from benchmarks._arguments import arguments
-from benchmarks._scenes import Model, Setting, neighbours, play, site, start, without
+from benchmarks._scenes import Model, Setting, begin, neighbours, play, site, without
 from feeders.model.site import unread
 from feeders.simulation.scenario import START
-from gridsec.arrays import Bools, Ints
-from gridsec.estimators.sequential import step
+from gridsec.arrays import Bools, Floats, Ints
+from gridsec.estimators.modal.monitor import ModalDesign, ModalState
 from gridsec.interface import Decision
+from gridsec.planning.unavoidable import ConeProgram, Faults
 
 FEEDERS = ("kerber-dorfnetz",)
 WITHHELD_S, LIE_S, END_S = 20.0, 95.0, 155.0
@@ -78,6 +79,15 @@ def places(setting: Setting, where: str, part: float) -> Ints:
     return np.sort(neighbours(site(setting.feeder), int(random.integers(meters)))[:count])
 
 
+def stealthy(design: ModalDesign, state: ModalState, meters: Ints) -> Floats:
+    """False voltages of some meters, (p,), squared pu, with the largest error of one reconstruction."""
+    accepted, prior = region(design, state, round(END_S - LIE_S)), design.front.prior
+    lies = Faults.voltages(meters, (prior.variance.size, prior.meters.size), LARGEST)
+    program, gain = ConeProgram(accepted, lies), lies.gain(accepted.weights)
+    found = [program(gain[x], SHARE) for x in prior.meters[meters]]
+    return np.asarray(lies.signature @ max(found, key=lambda one: one.size).amounts)
+
+
 def run(setting: Setting, meters: Ints, *, lying: bool, stated: bool) -> Played:
     """Play and watch one run.
 
@@ -92,7 +102,7 @@ def run(setting: Setting, meters: Ints, *, lying: bool, stated: bool) -> Played:
     stated
         Whether frames state the origin of the powers.
     """
-    (made, state), where = start(setting), site(setting.feeder)
+    (made, state), where = begin(setting), site(setting.feeder)
     silent: Bools = np.zeros(len(where.tables.customers), dtype=np.bool_)
     silent[where.meters[meters]] = True
     gone, nothing, lie = np.isin(np.arange(where.meters.size), meters), unread(where), np.zeros(1)
@@ -100,12 +110,10 @@ def run(setting: Setting, meters: Ints, *, lying: bool, stated: bool) -> Played:
     for frame, truth in play(setting, END_S):
         age = frame.t - START
         if lying and age == LIE_S:
-            given = _stealthy.linear_tests(made, state)
-            room = SHARE * (_stealthy.misfit_limit(made) - where.meters.size)
-            lie = _stealthy.within_misfit(given, meters, room, share=SHARE).lie
+            lie = stealthy(made.design, state, meters)
         seen = without(frame, nothing, silent) if age >= WITHHELD_S else frame
         seen = replace(seen, y=seen.y + lie, p_origin=seen.p_origin if stated else None)
-        state, estimate, verdict = step(made, state, seen)
+        state, estimate, verdict = made.step(state, seen)
         named |= verdict.suspects
         if age >= (LIE_S if lying else WITHHELD_S):
             error = np.abs(estimate.v2 - truth.v2)

@@ -1,4 +1,4 @@
-"""What the sequential monitor makes of manipulations where meters are read every minute or quarter hour.
+"""Kinds of manipulations where meters are read every minute or quarter hour.
 
     python -m benchmarks.slow_kinds [interval in s] [seeds] [days] [feeder ...]
 
@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, Snapshot, from_tables, load, to_frame
-from feeders.registry import SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.registry import DesignedEstimator, design
 from feeders.simulation.scenario import Scenario, simulate, snapshots
 from gridsec.arrays import Floats, Ints
 
@@ -88,8 +88,7 @@ class Seen:
 
 
 def read_every(site: Site, step_s: float) -> Site:
-    """The same feeder, watched by the sequential monitor, read every so many seconds."""
-    site = choose(site, estimator=SEQUENTIAL)
+    """The same feeder, read once in a time, s."""
     meta = site.tables.meta
     meta = replace(meta, monitor=replace(meta.monitor, tick_s=step_s))
     return from_tables(replace(site.tables, meta=meta))

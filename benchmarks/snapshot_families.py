@@ -25,7 +25,7 @@ from feeders.model.site import load
 from feeders.registry import DesignedEstimator, choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, TrialResult, frames, judge
-from gridsec.estimators.sequential import SequentialDesign
+from gridsec.estimators.single_tick import SingleTickDesign
 
 DECODERS = ("weighted-least-squares", "l0-decoder", "basis-pursuit", "matching-pursuit")
 TRICKS = (AttackKind.BIAS, AttackKind.TOGETHER, AttackKind.COORDINATED)
@@ -65,10 +65,10 @@ SCENES = (
 )
 
 
-def correlation(made: SequentialDesign) -> float:
-    """The largest between the readings of two honest meters."""
-    S = made.prior.between
-    std = np.sqrt(np.diag(S) + made.white + made.fixed)
+def correlation(made: SingleTickDesign) -> float:
+    """Largest correlation between the readings of two honest meters, 1."""
+    S = made.front.prior.between
+    std = np.sqrt(np.diag(S) + made.noise)
     return float((S / np.multiply.outer(std, std) - np.diag(np.diag(S) / std**2)).max())
 
 

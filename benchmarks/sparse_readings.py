@@ -1,4 +1,4 @@
-"""The sequential monitor where readings are few: half of the meters silent, and every interval.
+"""The default estimator where readings are few: half of the meters silent, and every interval.
 
     python -m benchmarks.sparse_readings [seeds] [feeder]
 
@@ -33,7 +33,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, from_tables, load
-from feeders.registry import SEQUENTIAL, choose, design
+from feeders.registry import design
 from feeders.simulation.plant import Channel, MeterOutage
 from feeders.simulation.scenario import START
 from feeders.simulation.trial import FrameTruth, Trial, frames
@@ -105,7 +105,7 @@ class Run:
 def run(site: Site, pattern: str, step_s: float, seed: int) -> Run:
     """Watch one run."""
     trial = Trial(site, seed, duration_s=(BEFORE + AFTER) * step_s, step_s=step_s)
-    watcher, at = design(choose(trial.stated, estimator=SEQUENTIAL)), trial.site.meters
+    watcher, at = design(trial.stated), trial.site.meters
     state, named_at, honest = None, np.full(at.size, np.inf), np.zeros(at.size, np.bool_)
     count, errors, blind, relative, took = np.zeros(at.size), [], [], [], []
     for tick, (frame, truth, liars) in enumerate(played(trial, pattern)):

@@ -1,6 +1,6 @@
 """A third of all meters in collusion, loads known only roughly, full AC power flow as truth.
 
-    python -m benchmarks.uncertain_loads [seeds] [feeder] [kW] [estimator]
+    python -m benchmarks.uncertain_loads [seeds] [feeder] [kW]
 
 Kerber Vorstadtnetz (146 meters) or another feeder, one reading per second, errors of the loads 0.6 kW, or as
 given, and a third of that in kvar, with a correlation time of 600 s. A third of the meters, random ones, lie:
@@ -28,7 +28,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from feeders.model.site import Site, from_tables, load
-from feeders.registry import SEQUENTIAL, DesignedEstimator, design
+from feeders.registry import DesignedEstimator, design
 from feeders.simulation.scenario import START
 from feeders.simulation.trial import (
     AttackKind,
@@ -41,7 +41,7 @@ from feeders.simulation.trial import (
     judge,
 )
 from gridsec.arrays import Floats, Ints
-from gridsec.estimators.sequential import Commission
+from gridsec.estimators.front import Commission
 
 FEEDER = "kerber-vorstadtnetz"
 LOAD_KW = 0.6
@@ -114,7 +114,7 @@ def trial(cell: Cell, seed: int, feeder: str = FEEDER, kw: float = LOAD_KW) -> T
     )
 
 
-def learn(this: Trial, estimator: str = SEQUENTIAL) -> Commission:
+def learn(this: Trial) -> Commission:
     """Learn the meters' fixed errors from six honest hours, a reading every ten seconds.
 
     Parameters
@@ -123,10 +123,10 @@ def learn(this: Trial, estimator: str = SEQUENTIAL) -> Commission:
         A run of them.
     """
     quiet = replace(this, duration_s=LEARN_S + 60.0, step_s=LEARN_STEP_S, lie=None)
-    made = _commissioned(quiet.stated, LEARN_S, estimator)
+    made = _commissioned(quiet.stated, LEARN_S)
     learning = made.bias_learning
     if learning is None:
-        raise RuntimeError(f"{estimator} does not learn")
+        raise RuntimeError("the estimator does not learn")
     state = made.init(START)
     for frame, _ in frames(quiet):
         state, _, verdict = made.step(state, frame)
@@ -139,34 +139,30 @@ def learn(this: Trial, estimator: str = SEQUENTIAL) -> Commission:
 
 
 @cache
-def _learned(meters: TrialMeterErrors, seed: int, feeder: str, kw: float, estimator: str) -> Commission:
+def _learned(meters: TrialMeterErrors, seed: int, feeder: str, kw: float) -> Commission:
     """Learn from honest hours, which are the same whatever lie follows them."""
-    return learn(trial(Cell("honest", AttackKind.BIAS, 0.0, 0.0, meters), seed, feeder, kw), estimator)
+    return learn(trial(Cell("honest", AttackKind.BIAS, 0.0, 0.0, meters), seed, feeder, kw))
 
 
-def _commissioned(site: Site, commission_s: float, estimator: str = SEQUENTIAL) -> DesignedEstimator:
+def _commissioned(site: Site, commission_s: float) -> DesignedEstimator:
     tables = site.tables
-    settings = replace(tables.meta.monitor, estimator=estimator, commission_s=commission_s)
+    settings = replace(tables.meta.monitor, commission_s=commission_s)
     return design(from_tables(replace(tables, meta=replace(tables.meta, monitor=settings))))
 
 
-def run(
-    cell: Cell, seed: int, feeder: str = FEEDER, kw: float = LOAD_KW, estimator: str = SEQUENTIAL
-) -> TrialResult:
+def run(cell: Cell, seed: int, feeder: str = FEEDER, kw: float = LOAD_KW) -> TrialResult:
     """Watch one seed of a cell.
 
     Parameters
     ----------
     cell, seed, feeder, kw
         As in `trial`.
-    estimator
-        Name of an estimator that learns.
     """
     this = trial(cell, seed, feeder, kw)
-    watcher = _commissioned(this.stated, 0.0, estimator)
+    watcher = _commissioned(this.stated, 0.0)
     learning = watcher.family.bias_learning
     if cell.learned and learning is not None:
-        known, begin = _learned(cell.meters, seed, feeder, kw, estimator), learning.init
+        known, begin = _learned(cell.meters, seed, feeder, kw), learning.init
         family = replace(watcher.family, init=lambda made, t: begin(made, t, known))
         watcher = replace(watcher, family=family)
     return judge(watcher, this, settling_s=cell.limit_s)
@@ -193,7 +189,8 @@ def doubted(feeder: str, kw: float) -> tuple[Floats, Floats]:
         As in `trial`.
     """
     stated = trial(CELLS[0], 0, feeder, kw).stated
-    S = _commissioned(stated, 0.0).design.prior.between
+    prior = _commissioned(stated, 0.0).design.front.prior
+    S = prior.covariance[prior.meters]
     variances = np.array([S.diagonal(), 1.0 / np.linalg.inv(S + _EXACT * np.eye(len(S))).diagonal()])
     alone, given = 50.0 * np.sqrt(variances)  # v is half as far off as its square
     return alone, given
@@ -203,7 +200,7 @@ def doubted(feeder: str, kw: float) -> tuple[Floats, Floats]:
 _EXACT = 1e-12
 
 
-def main(seeds: int, feeder: str, kw: float, estimator: str = SEQUENTIAL) -> int:
+def main(seeds: int, feeder: str, kw: float) -> int:
     """Run everything and print a table; 1 if a limit was missed."""
     alone, given = doubted(feeder, kw)
     print(
@@ -214,7 +211,7 @@ def main(seeds: int, feeder: str, kw: float, estimator: str = SEQUENTIAL) -> int
     print(f"{'':22}{'named in time':>22}{'falsely':>9}{'delay s':>9}{'error %':>9}{'ms per step':>20}")
     site, good = load(feeder), True
     for cell in CELLS:
-        outcomes = [run(cell, seed, feeder, kw, estimator) for seed in range(seeds)]
+        outcomes = [run(cell, seed, feeder, kw) for seed in range(seeds)]
         fair = [each for each in outcomes if not outvoted(site, each.liars)]
         named, liars, false = _counts(cell, outcomes)
         delay = np.concatenate([each.delay_s for each in outcomes])
@@ -241,5 +238,5 @@ def _counts(cell: Cell, outcomes: list[TrialResult]) -> tuple[int, int, int]:
 
 
 if __name__ == "__main__":
-    asked = arguments(__doc__, seeds=20, feeder=FEEDER, kw=LOAD_KW, estimator=SEQUENTIAL)
-    sys.exit(main(asked.seeds, asked.feeder, asked.kw, asked.estimator))
+    asked = arguments(__doc__, seeds=20, feeder=FEEDER, kw=LOAD_KW)
+    sys.exit(main(asked.seeds, asked.feeder, asked.kw))

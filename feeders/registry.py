@@ -29,17 +29,16 @@ from gridsec.arrays import Bools, Floats
 from gridsec.errors import DesignInfeasible, FeederInvalid, GridsecError, InputInvalid, NotObservable, Problem
 from gridsec.estimators import (
     exact_bank,
+    front,
     partial,
-    sequential,
     set_search,
     single_tick,
     unknown_input,
     windowed,
 )
 from gridsec.estimators.exact_bank.bank import MOST_OBSERVERS, Gains
+from gridsec.estimators.front import Commission, LearningProgress, ObserverRecord, SuspicionRecord
 from gridsec.estimators.modal import monitor as modal
-from gridsec.estimators.sequential import Commission, LearningProgress, ObserverRecord, SuspicionRecord
-from gridsec.estimators.sequential.search import Decoder
 from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.certificates import certify
 from gridsec.observers.design_archive import cached
@@ -52,7 +51,6 @@ __all__ = [
     "FAMILIES",
     "LMI",
     "MODAL",
-    "SEQUENTIAL",
     "BankGains",
     "BiasLearning",
     "DesignCache",
@@ -353,9 +351,6 @@ def bank_gains(
 # --- Estimators by name ---
 
 
-SEQUENTIAL: Final = "sequential"
-"""One observer, a decoder with correlated load errors, evidence on several time scales."""
-
 MODAL: Final = "modal"
 """One Kalman filter of loads and fixed errors, one e-detector, one search over subsets."""
 
@@ -393,19 +388,9 @@ def design(
     )
 
 
-def _sequential(site: Site, _: DesignOptions) -> sequential.SequentialDesign:
-    settings = site.tables.meta.monitor
-    options = sequential.SequentialOptions(
-        alarms_per_year=settings.alarms_per_year,
-        commission_s=settings.commission_s,
-        unread_std_percent=settings.unread_std_percent,
-    )
-    return sequential.design(plant(site), doubt=load_doubt(site), step_s=settings.tick_s, options=options)
-
-
 def _modal(site: Site, _: DesignOptions) -> modal.ModalDesign:
     settings = site.tables.meta.monitor
-    options = sequential.SequentialOptions(
+    options = front.FrontOptions(
         alarms_per_year=settings.alarms_per_year,
         commission_s=settings.commission_s,
         unread_std_percent=settings.unread_std_percent,
@@ -433,7 +418,10 @@ def _lmi_bank(site: Site, job: DesignOptions) -> exact_bank.MonitorDesign:
 
 
 def _certificate(
-    design: exact_bank.MonitorDesign | sequential.SequentialDesign | set_search.SetSearchDesign,
+    design: exact_bank.MonitorDesign
+    | modal.ModalDesign
+    | set_search.SetSearchDesign
+    | single_tick.SingleTickDesign,
 ) -> str:
     proof = design.certificate
     return f"{proof.kind} certificate, margin {proof.margin:.3g}, decay at least {proof.rate:.3g} 1/s"
@@ -516,10 +504,10 @@ def _load_columns(site: Site) -> Floats:
     return np.hstack([2.0 * model.R * dp, 2.0 * model.X * dq])
 
 
-def _ticks(name: str, summary: str, decoder: Decoder) -> Estimator:
+def _ticks(name: str, summary: str, decoder: single_tick.Decoder) -> Estimator:
     """Estimator that tests every tick by itself."""
 
-    def make(site: Site, _: DesignOptions) -> sequential.SequentialDesign:
+    def make(site: Site, _: DesignOptions) -> single_tick.SingleTickDesign:
         settings = site.tables.meta.monitor
         return single_tick.design(
             plant(site),
@@ -528,9 +516,10 @@ def _ticks(name: str, summary: str, decoder: Decoder) -> Estimator:
             step_s=settings.tick_s,
             max_attacked=settings.max_attacked,
             alarms_per_year=settings.alarms_per_year,
+            unread_std_percent=settings.unread_std_percent,
         )
 
-    return _of(sequential, name, summary, design=make)
+    return _of(single_tick, name, summary, design=make)
 
 
 class Families(Mapping[str, Estimator]):
@@ -555,26 +544,6 @@ FAMILIES: Final = Families(
     (
         replace(
             _of(
-                sequential,
-                SEQUENTIAL,
-                "one switched observer, correlated loads, evidence on several time scales",
-                design=_sequential,
-            ),
-            withstands=lambda d: int(d.max_attacked),
-            bias_learning=BiasLearning(
-                needed_s=lambda d: float(d.options.commission_s),
-                init=lambda d, t, known: sequential.init(d, t, known.learned, known.learning),
-                commission=lambda state: state.commission,
-                renew=sequential.renew,
-                read=sequential.from_arrays,
-                arrays=lambda _, known: sequential.to_arrays(known),
-                progress=sequential.progress,
-            ),
-            warm_start=WarmStart(sequential.distrusted, sequential.warm_start),
-            observer_memory=ObserverMemory(sequential.settling_s, sequential.observed, sequential.resume),
-        ),
-        replace(
-            _of(
                 modal,
                 MODAL,
                 "one filter of loads and meter errors, an e-detector, a search over subsets",
@@ -591,9 +560,7 @@ FAMILIES: Final = Families(
                 progress=modal.progress,
             ),
             warm_start=WarmStart(modal.distrusted, modal.warm_start),
-            observer_memory=ObserverMemory(
-                lambda d: sequential.settling_s(d.front), modal.observed, modal.resume
-            ),
+            observer_memory=ObserverMemory(lambda d: front.settling_s(d.front), modal.observed, modal.resume),
         ),
         _of(exact_bank, DIRECT, "banks of circle-criterion observers, direct injection (chong2020)"),
         _of(exact_bank, LMI, "the same banks, gains by matrix inequality (chong2020)", design=_lmi_bank),

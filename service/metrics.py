@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
-from gridsec.estimators.sequential import LearningReason, LearningState
+from gridsec.estimators.front import LearningReason, LearningState
 from gridsec.interface import Decision
 from service.ingest.align import ReadingOutcome
 from service.ingest.queues import BusCounts

@@ -24,7 +24,7 @@ from benchmarks.peers.answer import Answer
 from benchmarks.peers.scene import Reading, Scene
 from feeders.simulation import powerflow
 from gridsec.arrays import Bools, Floats
-from gridsec.estimators.sequential.posterior import LoadDoubt, condition, remove_meter, voltage_prior
+from gridsec.estimators.front.posterior import LoadDoubt, condition, remove_meter, voltage_prior
 
 _SQRT3 = np.sqrt(3.0)
 

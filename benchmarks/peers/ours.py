@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.peers.answer import Answer
 from benchmarks.peers.scene import Reading, Scene
 from gridsec.arrays import Bools, Floats
-from gridsec.estimators.sequential.posterior import Prior
+from gridsec.estimators.front.posterior import Prior
 from gridsec.estimators.snapshot.identification import ErrorPrior, FalsePowers, identify
 from gridsec.grid.radial import Feeder
 

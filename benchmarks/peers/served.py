@@ -11,7 +11,9 @@ import numpy as np
 
 from benchmarks.peers.scene import Scene, Snapshot
 from gridsec.arrays import Bools
-from gridsec.estimators import sequential
+from gridsec.estimators.front import LoadDoubt
+from gridsec.estimators.modal import monitor
+from gridsec.estimators.modal.monitor import ModalDesign
 from gridsec.estimators.plant import Plant
 from gridsec.grid.devices import Droop, MeterAccuracy
 from gridsec.interface import Decision, Frame
@@ -20,14 +22,14 @@ from gridsec.interface import Decision, Frame
 _LASTS_S = 3600.0
 
 
-def watch(here: Scene, told: Snapshot) -> sequential.SequentialDesign:
+def watch(here: Scene, told: Snapshot) -> ModalDesign:
     """Prepare to watch, with the standard deviations that all methods are told and default options."""
     n = told.liars.size
     noise, none = np.full(n, told.std_v), np.zeros(n)
     accuracy = MeterAccuracy(none, none, noise, 0.0, 0.0, told.std_v)
     fleet = Droop(np.zeros(0, dtype=np.intp), np.zeros((0, 4)), np.zeros((0, 4)), np.zeros(0))
-    doubt = sequential.LoadDoubt(told.std_p, told.std_q, _LASTS_S)
-    return sequential.design(Plant(here.feeder, fleet, np.arange(n), accuracy), doubt=doubt, step_s=1.0)
+    doubt = LoadDoubt(told.std_p, told.std_q, _LASTS_S)
+    return monitor.design(Plant(here.feeder, fleet, np.arange(n), accuracy), doubt=doubt, step_s=1.0)
 
 
 def frame(told: Snapshot, t: int) -> Frame:
@@ -50,9 +52,9 @@ def frame(told: Snapshot, t: int) -> Frame:
 def suspects(here: Scene, told: Snapshot) -> Bools:
     """Meters named after the last of the readings; none while the monitor is undecided."""
     design = watch(here, told)
-    state = sequential.init(design, 0.0)
+    state = monitor.init(design, 0.0)
     named = np.zeros(told.liars.size, dtype=np.bool_)
     for t in range(len(told.v)):
-        state, _, verdict = sequential.step(design, state, frame(told, t))
+        state, _, verdict = monitor.step(design, state, frame(told, t))
         named = verdict.suspects & (verdict.decision is Decision.ATTACKED)
     return named

@@ -18,7 +18,7 @@ from benchmarks.peers.grid_model import Greedy
 from benchmarks.peers.measure import cells
 from benchmarks.peers.ours import Ours
 from benchmarks.peers.scene import Scene, Snapshot, mean, scene, snapshot
-from gridsec.estimators import sequential
+from gridsec.estimators.modal import monitor
 
 FEEDER = "rural3-behind"
 REPEATS, SNAPSHOTS, SECONDS, STEADY = 12, 15, 30, 5
@@ -39,14 +39,14 @@ def fastest(calls: tuple[Callable[[], object], ...]) -> list[float]:
 def steps(here: Scene, told: Snapshot) -> tuple[float | None, float]:
     """Milliseconds of the served monitor's step that names first, if one does, and of a steady one."""
     design = served.watch(here, told)
-    state, named, times = sequential.init(design, 0.0), False, []
+    state, named, times = monitor.init(design, 0.0), False, []
     naming: float | None = None
     for t in range(len(told.v)):
         frame, before = served.frame(told, t), state
-        after, _, verdict = sequential.step(design, before, frame)
+        after, _, verdict = monitor.step(design, before, frame)
         now = bool(verdict.suspects.any())
         if (now and not named) or t >= len(told.v) - STEADY:
-            times.append(fastest((lambda: sequential.step(design, before, frame),))[0])  # noqa: B023
+            times.append(fastest((lambda: monitor.step(design, before, frame),))[0])  # noqa: B023
         if now and not named:
             naming, named = times.pop(), True
         state = after

@@ -22,7 +22,7 @@ plan = ComparisonPlan(
     duration_s=75.0,
     load_error=LoadError(p_kw=0.1, q_kvar=0.05),
     meters=TrialMeterErrors.SITE,  # a fixed error within the class of each, rounding and jitter
-    families=("sequential", "exact-bank", "weighted-least-squares"),
+    families=("modal", "exact-bank", "weighted-least-squares"),
     cases=("clean", "bias", "coordinated"),
 )
 rows = compare(site, plan)

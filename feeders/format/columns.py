@@ -237,7 +237,6 @@ PHASES: Final = ("abc", "a", "b", "c")
 LINE_PHASES: Final = (*PHASES, "ab", "bc", "ca")
 SUSPICIONS: Final = ("voltage", "impedance", "ratio", "rating", "load", "class")
 OWN_ESTIMATORS: Final = (
-    "sequential",
     "modal",
     "exact-bank",
     "exact-bank-lmi",
@@ -428,10 +427,10 @@ class LoadDefaults:
 class MonitorDefaults:
     """Settings of the monitor."""
 
-    estimator: Annotated[str, Text("estimator family", choices=ESTIMATORS)] = "modal"
-    max_attacked: Annotated[
-        int, Whole("manipulated meters to withstand; `sequential`, `modal`: a third", 0, 1000)
-    ] = 1
+    estimator: Annotated[
+        str, Text("estimator family; `modal` replaces the former `sequential`", choices=ESTIMATORS)
+    ] = "modal"
+    max_attacked: Annotated[int, Whole("manipulated meters to withstand; `modal`: a third", 0, 1000)] = 1
     tick_s: Annotated[float, Number("period of the frames, s", 0.01, 1e5)] = 1.0
     on_delay_s: Annotated[float, Number("how long a condition must last to raise an alarm, s", 0, 1e6)] = 2.0
     off_delay_s: Annotated[float, Number("how long it must be gone to clear it, s", 0, 1e6)] = 5.0

@@ -13,7 +13,7 @@ model's (injection positive).
 
 References
 ----------
-docs/theory-sequential.md, section 7.
+docs/theory-front.md, section 7.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ from feeders.model.forecast import Forecast, always, forecast
 from feeders.model.three_phase import spanned_valid, unsupported
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, frozen
 from gridsec.errors import FeederInvalid, InputInvalid, Problem
+from gridsec.estimators.front import LoadDoubt
 from gridsec.estimators.plant import Plant
-from gridsec.estimators.sequential import LoadDoubt
 from gridsec.grid import AnyNetwork
 from gridsec.grid.meshed import MeshedFeeder, PhasedMesh
 from gridsec.grid.network import Power

@@ -24,9 +24,9 @@ from feeders.studies.running import Here, Progress, Runner, Where, cores, run_pi
 from feeders.studies.unobservable import CurvePositions
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, Problem, raise_if_any
+from gridsec.estimators.front.state import settling_s
 from gridsec.estimators.modal import estimate, monitor, rivals
 from gridsec.estimators.modal.monitor import ModalDesign
-from gridsec.estimators.sequential.state import settling_s
 from gridsec.interface import Frame
 from gridsec.planning.collusion import Corridor, furthest
 from gridsec.planning.detectability import (

@@ -11,7 +11,7 @@ of H_a are used if they improve the fit by more than their price, ln T each. H_b
 explain the size of the deviation as well as its changes with the loads. A window with constant loads decides
 nothing.
 
-Source: docs/theory-sequential.md, Errors of the files.
+Source: docs/theory-front.md, section 9.
 """
 
 from __future__ import annotations

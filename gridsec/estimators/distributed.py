@@ -47,7 +47,7 @@ from scipy.special import gammainccinv
 
 from gridsec.arrays import Bools, Floats, Ints
 from gridsec.errors import InputInvalid, Problem, raise_if_any
-from gridsec.estimators.sequential.posterior import EXACT, UNMETERED, LoadDoubt
+from gridsec.estimators.front.posterior import EXACT, UNMETERED, LoadDoubt
 from gridsec.grid.network import below, from_root
 from gridsec.grid.radial import Feeder
 from gridsec.interface import Decision

@@ -154,12 +154,6 @@ class Network(Protocol):
     def between(self, power: Power) -> Floats:
         """R or X from every customer's power to every customer's voltage, (N, N)."""
 
-    def weighted_sensitivity(self, power: Power, customers: Ints, weights: Floats) -> Floats:
-        """Sensitivity of a weighted sum of p different customers' voltages to each power, (N,)."""
-
-    def squared_sensitivity(self, power: Power, customers: Ints) -> Floats:
-        """Sum over the voltages at `customers` (p,) of squared sensitivities to each power, (N,)."""
-
     def self_impedance(self, power: Power) -> Floats:
         """Half the sensitivity of a customer's voltage to its own power: the diagonal of R or X, (N,)."""
 
@@ -275,14 +269,6 @@ class OfMatrices:
         """See `Network`."""
         return _matrix(self, power)[self.bus]
 
-    def weighted_sensitivity(self: WithMatrices, power: Power, customers: Ints, weights: Floats) -> Floats:
-        """See `Network`."""
-        return 2.0 * (weights @ _matrix(self, power)[self.bus[customers]])
-
-    def squared_sensitivity(self: WithMatrices, power: Power, customers: Ints) -> Floats:
-        """See `Network`."""
-        return np.asarray(4.0 * (_matrix(self, power)[self.bus[customers]] ** 2).sum(axis=0))
-
     def self_impedance(self: WithMatrices, power: Power) -> Floats:
         """See `Network`."""
         return np.asarray(_matrix(self, power)[self.bus, np.arange(self.bus.size)])
@@ -308,10 +294,6 @@ def unbounded(bound: Floats) -> Floats:
 
 _KEPT = 1 << 19
 """Largest number of entries of 2R and 2X that are kept, 4 MB."""
-
-
-_SELECTED_PART = 0.25
-"""Part of the table's rows from which the whole product is faster than a selection."""
 
 
 _BLOCK = 256
@@ -350,18 +332,6 @@ class Sensitivities:
         for power, some in ((Power.ACTIVE, which < count), (Power.REACTIVE, which >= count)):
             out[:, some] = self.feeder.columns(power, which[some] % count)
         return out
-
-    def weighted(self, customers: Ints, weights: Floats) -> Floats:
-        """Change of the weighted sum of the voltages of customers (p,) by each power, (2 N,)."""
-        if self.table is None:
-            return np.concatenate(
-                [self.feeder.weighted_sensitivity(power, customers, weights) for power in Power]
-            )
-        at = self.feeder.bus[customers]
-        if at.size < _SELECTED_PART * len(self.table):
-            return np.asarray(weights @ self.table[at])
-        # A product with the whole table is faster than a selection of most rows.
-        return np.asarray(np.bincount(at, weights=weights, minlength=len(self.table)) @ self.table)
 
     def rows(self, places: Ints) -> Iterator[Floats]:
         """Changes at places (k,) by all powers in the order of their numbers, in parts (k, …)."""

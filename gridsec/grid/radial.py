@@ -185,19 +185,6 @@ class Feeder(Balanced):
         """See `Network`."""
         return 0.5 * self.columns(power, np.arange(self.bus.size))[self.bus]
 
-    def weighted_sensitivity(self, power: Power, customers: Ints, weights: Floats) -> Floats:
-        """See `Network`. R and X are symmetric: the voltages by powers `weights`."""
-        injected = np.zeros((2, self.bus.size))
-        injected[0, customers] = weights
-        p, q = injected if power is Power.ACTIVE else injected[::-1]
-        return np.asarray(self.bus_voltages(p, q, 0.0, steps=0)[self.bus])
-
-    def squared_sensitivity(self, power: Power, customers: Ints) -> Floats:
-        """See `Network`."""
-        weight = np.zeros(self.bus.size)
-        weight[customers] = 1.0
-        return self.variances(power, weight)[self.bus]
-
     def self_impedance(self, power: Power) -> Floats:
         """See `Network`."""
         return path_sums(self, self._branch(power))[self.bus]

@@ -38,7 +38,7 @@ from scipy.special import chdtri, chndtr, ndtr, ndtri
 
 from gridsec.arrays import Floats, Ints
 from gridsec.errors import DesignInfeasible, InputInvalid, Problem
-from gridsec.estimators.sequential.design import YEAR_S
+from gridsec.estimators.front.design import YEAR_S
 
 __all__ = [
     "AcceptanceRegion",

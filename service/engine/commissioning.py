@@ -18,7 +18,7 @@ from feeders.model.site import Site
 from feeders.registry import BiasLearning, DesignedEstimator
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import GridsecError, Problem
-from gridsec.estimators.sequential import (
+from gridsec.estimators.front import (
     Commission,
     Learning,
     LearningProgress,

@@ -23,7 +23,7 @@ from feeders import registry
 from feeders.model.site import PowerAges, Site, to_frame
 from feeders.registry import DesignedEstimator, ObserverMemory, WarmStart
 from gridsec.arrays import any_of
-from gridsec.estimators.sequential import SuspicionRecord
+from gridsec.estimators.front import SuspicionRecord
 from gridsec.interface import Cause
 from service.alarms import displayed
 from service.alarms.conditions import AlarmKind, Condition, Severity, conditions, identity_mismatches

@@ -18,7 +18,7 @@ from pydantic import Field, TypeAdapter
 
 from feeders.model.site import Site, Snapshot, volts
 from gridsec.arrays import Bools, Floats, all_of, any_of
-from gridsec.estimators.sequential import LearningReason, LearningState
+from gridsec.estimators.front import LearningReason, LearningState
 from gridsec.grid import Feeder
 from gridsec.interface import Cause, Decision, Estimate, Verdict
 from service.ingest.align import Tick

@@ -24,8 +24,8 @@ from feeders.format.tables import to_json
 from feeders.model.site import Site
 from gridsec.arrays import Floats
 from gridsec.errors import GridsecError
+from gridsec.estimators.front import ObserverRecord, SuspicionRecord
 from gridsec.estimators.plant import NO_VOLTAGE
-from gridsec.estimators.sequential import ObserverRecord, SuspicionRecord
 from service.access.signing import SignedOrder
 from service.report.report import Phase, busbar_phases
 

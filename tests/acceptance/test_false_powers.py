@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import load, to_frame
-from feeders.registry import SEQUENTIAL, choose, design
+from feeders.registry import choose, design
 from feeders.simulation.attacks import AttackKind, AttackSpec, manipulations
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from gridsec.interface import Cause, Decision
@@ -20,7 +20,7 @@ ONSET_S = 30.0
 @pytest.mark.parametrize("size", [1.0, 2.0])
 def test_a_power_that_is_false_is_told_as_a_power(size: float) -> None:
     """CIGRE LV with its 6 meters, where one load moves half of them: AC power flow, eight runs."""
-    site = choose(load("cigre-lv"), max_attacked=2, estimator=SEQUENTIAL)
+    site = choose(load("cigre-lv"), max_attacked=2)
     watcher, told = design(site), 0
     for seed in range(8):
         profile = float(np.random.default_rng(seed).uniform(0.0, 13.9 * 86_400.0))
@@ -45,7 +45,7 @@ def test_a_power_that_is_false_is_told_as_a_power(size: float) -> None:
 
 def test_residuals_made_with_a_power_that_was_doubted_name_nobody_afterwards() -> None:
     """A claim of 80 kW passes what is credible: from then on the customer's usual load stands for it."""
-    site = choose(load("kerber-landnetz"), max_attacked=2, estimator=SEQUENTIAL)
+    site = choose(load("kerber-landnetz"), max_attacked=2)
     watcher, seed = design(site), 9
     profile = float(np.random.default_rng(seed).uniform(0.0, 13.9 * 86_400.0))
     quiet = Scenario(seed=seed, duration_s=90.0, profile_s=profile)

@@ -17,7 +17,7 @@ LIMIT_MB = {13: 110.0, 1000: 220.0}
 def test_customers_of_whom_a_third_lies_fit_into_the_memory(customers: int) -> None:
     """In a process of its own: the peak is that of the design, quiet minutes and the attack together."""
     done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.sequential_step", "--one", str(customers)],
+        [sys.executable, "-m", "benchmarks.core_growth", "--one", str(customers)],
         capture_output=True,
         check=True,  # it fails unless exactly the liars are named
         text=True,

@@ -29,7 +29,7 @@ from benchmarks.peers.measure import (
 from benchmarks.peers.ours import Covariance
 from benchmarks.peers.scene import SIZE, Cell, Scene, mean, scene, snapshot
 from benchmarks.peers.served import frame, suspects, watch
-from gridsec.estimators import sequential
+from gridsec.estimators.modal import monitor
 from gridsec.interface import Cause
 
 FEEDER = "rural1-behind"
@@ -166,9 +166,9 @@ def test_a_false_report_accuses_no_honest_neighbour_and_not_the_busbar(
     cell = Cell(feeder, 0.001, 0.1, "coord+pq", liars)
     told = snapshot(scene(feeder), cell, np.random.default_rng([2026, trial, liars]), 60)
     design = watch(scene(feeder), told)
-    state = sequential.init(design, 0.0)
+    state = monitor.init(design, 0.0)
     for t in range(20):
-        state, _, verdict = sequential.step(design, state, frame(told, t))
+        state, _, verdict = monitor.step(design, state, frame(told, t))
         assert not verdict.busbar.any()
         assert not (verdict.suspects & ~told.liars).any()
     np.testing.assert_array_equal(verdict.suspects, told.liars)
@@ -181,9 +181,9 @@ def test_rival_with_a_false_power_prevents_the_name_of_an_honest_meter() -> None
     told = snapshot(here, cell, np.random.default_rng([_SEED, 26, liars]), 60)
     assert np.flatnonzero(told.liars).tolist() == [5, 12]
     design = watch(here, told)
-    state, reasons = sequential.init(design, 0.0), []
+    state, reasons = monitor.init(design, 0.0), []
     for t in range(60):
-        state, _, verdict = sequential.step(design, state, frame(told, t))
+        state, _, verdict = monitor.step(design, state, frame(told, t))
         assert not (verdict.suspects & ~told.liars).any()
         reasons.append(verdict.cause)
     assert reasons[-1] is Cause.AMBIGUOUS

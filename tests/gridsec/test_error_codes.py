@@ -18,8 +18,8 @@ from gridsec.attack import Bias, Replay, Stuck, coordinate
 from gridsec.estimators import exact_bank, windowed
 from gridsec.estimators.distributed import Message
 from gridsec.estimators.exact_bank import bank
+from gridsec.estimators.front import FrontOptions, LoadDoubt
 from gridsec.estimators.plant import Options
-from gridsec.estimators.sequential import LoadDoubt, SequentialOptions
 from gridsec.grid.devices import Droop, fleet, preset
 from gridsec.grid.meshed import MeshedFeeder
 from gridsec.grid.phased import PhasedFeeder
@@ -267,8 +267,8 @@ CALLS: dict[str, Callable[[], Any]] = {
     "options of a monitor": lambda: Options(
         np.nan, confirm=0, release=0, settled=0.0, tie=-1.0, widest=np.nan, v2_limits=(2.0, 1.0)
     ),
-    "options of the sequential monitor": lambda: SequentialOptions(
-        alarms_per_year=0.0, scales_s=(np.nan,), enough=0.0, several=-1, release=0, suspect=1.0, like=0.5
+    "options of the front end": lambda: FrontOptions(
+        alarms_per_year=0.0, enough=0.0, release=0, suspect=1.0, like=0.5
     ),
     "uncertainty of loads": lambda: LoadDoubt(
         np.array([-1.0]), np.array([np.nan]), 0.0, common_p=2.0, common_q=-1.0

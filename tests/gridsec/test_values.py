@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gridsec.arrays import changed
-from gridsec.estimators import sequential
-from tests.gridsec.estimators.sequential.test_monitor import prepare
+from gridsec.estimators import front
+from tests.gridsec.estimators.modal.streets import front_end
 from tests.gridsec.street import make_plant
 
 
@@ -70,9 +70,9 @@ def test_fields_that_are_not_there_are_refused() -> None:
 
 
 def test_a_state_keeps_all_else() -> None:
-    design = prepare(make_plant(np.random.default_rng(1), customers=12, drop=0.03))
-    state = sequential.init(design, 5.0)
-    quick, slow = (each(state, t=7.0, voltage_swing=0.25) for each in (changed, replace))
+    design = front_end(make_plant(np.random.default_rng(1), customers=12, drop=0.03))
+    state = front.init(design, 5.0)
+    quick, slow = (each(state, t=7.0, ticks=25) for each in (changed, replace))
     for each in fields(state):
-        assert getattr(quick, each.name) is getattr(slow, each.name) or each.name in ("t", "voltage_swing")
-    assert (quick.t, quick.voltage_swing, state.t, state.voltage_swing) == (7.0, 0.25, 5.0, 0.0)
+        assert getattr(quick, each.name) is getattr(slow, each.name) or each.name in ("t", "ticks")
+    assert (quick.t, quick.ticks, state.t, state.ticks) == (7.0, 25, 5.0, 0)

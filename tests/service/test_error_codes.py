@@ -30,7 +30,7 @@ import service
 from feeders.format.tables import to_json
 from feeders.model.site import load
 from gridsec.errors import FeederInvalid, GridsecError, InputInvalid, Problem
-from gridsec.estimators.sequential import SuspicionRecord
+from gridsec.estimators.front import SuspicionRecord
 from service import app
 from service.access import pki
 from service.access.identity import NotAuthenticated, Role
@@ -621,7 +621,7 @@ CALLS: dict[str, Call] = {
     "stored state before a change of the feeder": damaged({}),
     "learning before the design": learning(None),
     "learning by another estimator": learning(watcher("exact-bank", learner=None)),
-    "learning for no time": learning(watcher("sequential", learner=object())),
+    "learning for no time": learning(watcher("modal", learner=object())),
     "demo without an answer": lambda _, __: demo.Service(cast(Any, None), "http://127.0.0.1:1", "").get("/"),
     "demo with another answer": http_status,
     "demo without a port": lambda _, __: demo.free_address("192.0.2.1:80"),

@@ -21,8 +21,8 @@ from feeders.studies.detectable import Detectable, Watched, hidden_attack, watch
 from feeders.studies.operating import SHARE, squared, volts_of_lie
 from feeders.studies.running import Progress, Where, run_pieces
 from gridsec.arrays import Bools, Floats
+from gridsec.estimators.front.posterior import LoadDoubt
 from gridsec.estimators.modal import monitor
-from gridsec.estimators.sequential.posterior import LoadDoubt
 from gridsec.interface import Frame
 from gridsec.planning.detectability import QUIET
 

@@ -52,7 +52,7 @@ from gridsec.attack import (
     reach,
 )
 from gridsec.errors import GridsecError, InputInvalid, Problem
-from gridsec.estimators.sequential import Commission
+from gridsec.estimators.front import Commission
 from gridsec.grid.network import Power
 from gridsec.interface import Decision, Frame
 

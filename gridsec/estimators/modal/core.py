@@ -11,8 +11,8 @@
     adopt(core, state, suspicion) -> CoreState                  where loads alone explain the readings
     estimate(core, state, suspicion) -> Estimated               where asked for
 
-The front end is that of `gridsec.estimators.sequential`: cleaning of frames, observer of the inverters,
-loss-corrected power flow. `residuals` reads the residuals that it leaves.
+The front end is that of `gridsec.estimators.front`: cleaning of frames, observer of the inverters,
+loss-corrected power flow.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from gridsec.arrays import Bools, Floats, Ints, any_of, indices
 from gridsec.errors import InputInvalid, Problem
+from gridsec.estimators.front.design import YEAR_S, FrontDesign
 from gridsec.estimators.modal import (
     classes,
     collusion,
@@ -54,8 +55,6 @@ from gridsec.estimators.modal.rivals import Rival
 from gridsec.estimators.modal.search import DOUBT, Identification, search
 from gridsec.estimators.modal.signatures import Columns, Joint
 from gridsec.estimators.modal.static import Static
-from gridsec.estimators.sequential.design import YEAR_S, SequentialDesign
-from gridsec.estimators.sequential.state import SequentialState
 from gridsec.grid.network import Power
 
 ACCUSATIONS = 1.0
@@ -240,7 +239,7 @@ def assemble(
     )
 
 
-def design(front: SequentialDesign, most: Floats | None = None) -> Core:
+def design(front: FrontDesign, most: Floats | None = None) -> Core:
     """Core of a feeder with a front end.
 
     Parameters
@@ -266,19 +265,6 @@ def design(front: SequentialDesign, most: Floats | None = None) -> Core:
         allowed=front.allowed,
         customers=front.plant.meters,
     )
-
-
-def residuals(state: SequentialState) -> tuple[Floats, Bools]:
-    """Last residuals of the front end with fixed errors included, squared pu (p,), and where there is one.
-
-    Parameters
-    ----------
-    state
-        State of the front end after a tick.
-    """
-    window = state.window
-    seen = window.available[-1]
-    return np.where(seen, window.residuals[-1] + state.learned.bias, 0.0), seen
 
 
 def init(core: Core, t: float) -> CoreState:

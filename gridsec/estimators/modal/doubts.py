@@ -48,17 +48,17 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from gridsec.arrays import Bools, Floats, all_of, any_of, indices
-from gridsec.estimators.modal.model import Modes
-from gridsec.estimators.plant import usual
-from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.measurements import (
+from gridsec.estimators.front.design import FrontDesign
+from gridsec.estimators.front.measurements import (
     COMMON_SHARE,
     ClockSkew,
     FrameUncertainty,
     Measurements,
     unread_powers,
 )
-from gridsec.estimators.sequential.posterior import EXACT, UNMETERED
+from gridsec.estimators.front.posterior import EXACT, UNMETERED
+from gridsec.estimators.modal.model import Modes
+from gridsec.estimators.plant import usual
 from gridsec.interface import PowerOrigin
 
 WIDER = 10.0
@@ -114,7 +114,7 @@ class Unknown:
 
 
 def unknown(  # noqa: PLR0917  # the state, and one frame
-    design: SequentialDesign,
+    design: FrontDesign,
     measured: Measurements,
     uncertainty: FrameUncertainty,
     injected: Floats,
@@ -152,10 +152,10 @@ def unknown(  # noqa: PLR0917  # the state, and one frame
         whole = np.hstack([whole, np.zeros((places, clocks.shape[1]))])
         meters = np.hstack([meters, clocks])
     factor = np.concatenate([factor, np.full(whole.shape[1] - factor.size, WIDER)])
-    return Unknown(whole, meters, factor, measured.available & ~uncertainty.vouched[0], powers)
+    return Unknown(whole, meters, factor, measured.available & ~uncertainty.vouched, powers)
 
 
-def reach(design: SequentialDesign) -> Floats:
+def reach(design: FrontDesign) -> Floats:
     """Largest effect of each power on a meter, in its white deviations per pu, (2 N,).
 
     Parameters
@@ -187,7 +187,7 @@ class Movements:
 
 
 def jump(
-    design: SequentialDesign, reach: Floats, before: Movements | None, measured: Measurements, h: float
+    design: FrontDesign, reach: Floats, before: Movements | None, measured: Measurements, h: float
 ) -> tuple[float, Movements]:
     """Variance of a jump of the loads' errors, in that of the loads, 1, and the movements with this frame.
 
@@ -238,7 +238,7 @@ _SIGNS = np.array([[1.0], [-1.0]])
 
 
 def _powers(
-    design: SequentialDesign,
+    design: FrontDesign,
     measured: Measurements,
     uncertainty: FrameUncertainty,
     injected: Floats,
@@ -249,10 +249,10 @@ def _powers(
     if uncertainty.usual and unsettled is None and doubt.sudden_p is None:
         return [], np.zeros(0)
     frame = usual(measured.frame)
-    p = _wider(frame.p_error, doubt.smooth_p, uncertainty.p[0] > 1.0, doubt.sudden_p)
-    q = _wider(frame.q_error, doubt.smooth_q, uncertainty.q[0] > 1.0, doubt.sudden_q)
+    p = _wider(frame.p_error, doubt.smooth_p, uncertainty.p > 1.0, doubt.sudden_p)
+    q = _wider(frame.q_error, doubt.smooth_q, uncertainty.q > 1.0, doubt.sudden_q)
     power, columns, factors = np.concatenate([p, q]), list[Floats](), list[Floats]()
-    unread = np.tile(unread_powers(design, uncertainty.p[0], uncertainty.read[0]), 2)
+    unread = np.tile(unread_powers(design, uncertainty), 2)
     which = indices((power > 0.0) & unread)
     if which.size:
         shared = design.sensitivities.numbered(which) @ power[which]
@@ -281,7 +281,7 @@ def _wider(error: Floats, known: Floats, wider: Bools, sudden: Floats | None) ->
 
 
 def _unsettled(
-    design: SequentialDesign, injected: Floats, free: Bools, metered: Bools
+    design: FrontDesign, injected: Floats, free: Bools, metered: Bools
 ) -> tuple[Floats, Floats] | None:
     """Standard deviations of injections that are known badly, (N,), pu, and factors on them, (N,); or None.
 
@@ -299,11 +299,11 @@ def _unsettled(
     return (np.where(out, error, 0.0), np.where(far, WIDER, FOLLOWS)) if any_of(out) else None
 
 
-def _clocks(design: SequentialDesign, measured: Measurements, skew: ClockSkew | None) -> Floats | None:
+def _clocks(design: FrontDesign, measured: Measurements, skew: ClockSkew | None) -> Floats | None:
     """Directions of meters with a voltage that changes within their clock offset, (p, k); None for none."""
     if skew is None:
         return None
-    change = skew.change[-1]
+    change = skew.change
     moved = measured.available & (change > SKEWED * np.sqrt(design.white))
     if not any_of(moved):
         return None

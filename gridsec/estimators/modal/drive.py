@@ -1,6 +1,6 @@
 """Inverters of the model, and readings that may be false at their inputs.
 
-    driven(...) -> (SequentialState, Measurements, Prediction)  no inverter follows a reading that jumps
+    driven(...) -> (FrontState, Measurements, Prediction)  no inverter follows a reading that jumps
     followed(...) -> InjectionError                             every tick
     fitted(...) -> Fit                                          every tick
 
@@ -28,13 +28,13 @@ from math import sqrt
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, any_of, changed
+from gridsec.estimators.front.design import FrontDesign
+from gridsec.estimators.front.measurements import FrameUncertainty, Measurements, measurements
+from gridsec.estimators.front.observer import injection_target, predict, relaxed
+from gridsec.estimators.front.state import FrontState, InjectionError, Prediction
 from gridsec.estimators.modal import classes, doubts, verdict
 from gridsec.estimators.modal.core import Core, CoreState
 from gridsec.estimators.modal.filter import Interval
-from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.measurements import FrameUncertainty, Measurements, measurements
-from gridsec.estimators.sequential.state import InjectionError, Prediction, SequentialState
-from gridsec.estimators.sequential.step import injection_target, predict, relaxed
 
 JUMP = 6.0
 """Standard deviations of an innovation beyond which a reading does not drive an inverter, 1."""
@@ -104,15 +104,15 @@ def expected(v2: Floats, own: Floats) -> Floats:
 
 
 def driven(  # noqa: PLR0917  # the state, and one frame
-    front: SequentialDesign,
+    front: FrontDesign,
     core: Core,
     state: CoreState,
-    given: SequentialState,
+    given: FrontState,
     measured: Measurements,
     uncertainty: FrameUncertainty,
     before: InjectionError,
     fit: Fit,
-) -> tuple[SequentialState, Measurements, Prediction]:
+) -> tuple[FrontState, Measurements, Prediction]:
     """Front end, measurements and prediction without inverters driven by a reading that jumps.
 
     A reading beyond `JUMP` standard deviations of its innovation counts as not trusted at this tick. What the
@@ -166,9 +166,9 @@ def driven(  # noqa: PLR0917  # the state, and one frame
 
 
 def followed(  # noqa: PLR0917  # the state, and one frame
-    front: SequentialDesign,
+    front: FrontDesign,
     before: InjectionError,
-    given: SequentialState,
+    given: FrontState,
     now: Prediction,
     free: Bools,
     h: float,

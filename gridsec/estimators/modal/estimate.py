@@ -31,13 +31,13 @@ from functools import cached_property, partial
 import numpy as np
 
 from gridsec.arrays import PENDING, Bools, Floats, deferred, indices, submatrix
+from gridsec.estimators.front.output import BoundedEstimate, BoundInputs
 from gridsec.estimators.modal.costs import SearchProblem, amounts, mean_amounts
 from gridsec.estimators.modal.filter import FilterState, Full
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.search import DOUBT, Identification
 from gridsec.estimators.modal.signatures import Joint
 from gridsec.estimators.modal.static import Static
-from gridsec.estimators.sequential.output import BoundedEstimate, BoundInputs
 from gridsec.interface import Estimate
 
 ROUNDING = 1e-12

@@ -37,8 +37,8 @@ from scipy.linalg import cholesky, eigh, solve_triangular
 
 from gridsec.arrays import Floats, Ints, submatrix
 from gridsec.errors import Problem, raise_if_any
-from gridsec.estimators.sequential.design import YEAR_S, SequentialDesign
-from gridsec.estimators.sequential.posterior import voltage_prior
+from gridsec.estimators.front.design import YEAR_S, FrontDesign
+from gridsec.estimators.front.posterior import voltage_prior
 
 FIXED_S = YEAR_S
 """Time constant of fixed errors, s. Meters age over years; with a day, lies of 0.5 %/h stay hidden."""
@@ -176,7 +176,7 @@ class ResidualModel:
         return np.diag(self.fixed[at]) + self.busbar * (H @ H.T)
 
 
-def residual_model(design: SequentialDesign) -> ResidualModel:
+def residual_model(design: FrontDesign) -> ResidualModel:
     """Model of the residuals of the front end.
 
     Parameters

@@ -6,7 +6,7 @@
 
 A step, by module:
 
-    sequential.measurements, step   front end: plausibility, observer of the inverters with its certificate,
+    front.measurements, observer    front end: plausibility, observer of the inverters with its certificate,
                                     loss-corrected voltages by the model
     drive                           inverters without readings that jump or are accused
     doubts                          directions that the frame leaves unknown
@@ -32,29 +32,20 @@ from functools import partial
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, changed
-from gridsec.estimators.modal import classes, core, doubts, drive, full, masking, record, verdict
-from gridsec.estimators.modal.core import Core, CoreState, Suspicion
-from gridsec.estimators.modal.detector import Evidence
-from gridsec.estimators.modal.doubts import Movements, Unknown
-from gridsec.estimators.modal.estimate import Reconstructed, Spread
-from gridsec.estimators.modal.naming import CONFIRM, alone, final
-from gridsec.estimators.modal.record import Record
-from gridsec.estimators.modal.search import DOUBT
-from gridsec.estimators.plant import Plant, nothing_new
-from gridsec.estimators.sequential import design as front_design
-from gridsec.estimators.sequential import init as front_init
-from gridsec.estimators.sequential import meter_bias
-from gridsec.estimators.sequential import state as front_state
-from gridsec.estimators.sequential.attack_kind import AttackKinds, classify, ingest, repeat_lags
-from gridsec.estimators.sequential.design import SequentialDesign, SequentialOptions
-from gridsec.estimators.sequential.device_checks import (
+from gridsec.estimators.front import design as front_design
+from gridsec.estimators.front import init as front_init
+from gridsec.estimators.front import meter_bias
+from gridsec.estimators.front import state as front_state
+from gridsec.estimators.front.attack_kind import AttackKinds, classify, ingest, repeat_lags
+from gridsec.estimators.front.design import FrontDesign, FrontOptions
+from gridsec.estimators.front.device_checks import (
     BusbarTrust,
     InverterChecks,
     ReportedPowers,
     check_inverters,
     track_busbar,
 )
-from gridsec.estimators.sequential.measurements import (
+from gridsec.estimators.front.measurements import (
     Measurements,
     checked,
     measurements,
@@ -63,7 +54,7 @@ from gridsec.estimators.sequential.measurements import (
     update_uncertainty,
     without_shifted_busbar,
 )
-from gridsec.estimators.sequential.meter_bias import (
+from gridsec.estimators.front.meter_bias import (
     Commission,
     Learned,
     Learning,
@@ -73,16 +64,25 @@ from gridsec.estimators.sequential.meter_bias import (
     ready_meters,
     usable,
 )
-from gridsec.estimators.sequential.output import BoundInputs
-from gridsec.estimators.sequential.posterior import UNMETERED, LoadDoubt
-from gridsec.estimators.sequential.reading_history import forget_readings
-from gridsec.estimators.sequential.state import (
+from gridsec.estimators.front.output import BoundInputs
+from gridsec.estimators.front.posterior import UNMETERED, LoadDoubt
+from gridsec.estimators.front.reading_history import forget_readings
+from gridsec.estimators.front.state import (
+    FrontState,
     InjectionError,
     ObserverRecord,
     Prediction,
-    SequentialState,
     SuspicionRecord,
 )
+from gridsec.estimators.modal import classes, core, doubts, drive, full, masking, record, verdict
+from gridsec.estimators.modal.core import Core, CoreState, Suspicion
+from gridsec.estimators.modal.detector import Evidence
+from gridsec.estimators.modal.doubts import Movements, Unknown
+from gridsec.estimators.modal.estimate import Reconstructed, Spread
+from gridsec.estimators.modal.naming import CONFIRM, alone, final
+from gridsec.estimators.modal.record import Record
+from gridsec.estimators.modal.search import DOUBT
+from gridsec.estimators.plant import Plant, nothing_new
 from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.certificates import Certificate
 
@@ -112,7 +112,7 @@ class ModalDesign:
         Largest transient of the observer beside the error at which a reading stands out, squared pu.
     """
 
-    front: SequentialDesign
+    front: FrontDesign
     core: Core
     reach: Floats = field(repr=False)
     negligible: Floats = field(repr=False)
@@ -123,7 +123,7 @@ class ModalDesign:
         return self.front.plant
 
     @property
-    def options(self) -> SequentialOptions:
+    def options(self) -> FrontOptions:
         """Tuning parameters of the front end; rate of false alarms and time of commissioning of the whole."""
         return self.front.options
 
@@ -148,14 +148,14 @@ def design(
     *,
     doubt: LoadDoubt,
     step_s: float,
-    options: SequentialOptions | None = None,
+    options: FrontOptions | None = None,
     max_attacked: int | None = None,
     most: Floats | None = None,
 ) -> ModalDesign:
     """Design the monitor of a feeder.
 
     most: (N,) largest active powers that the customers can have, pu. Others as in
-    `gridsec.estimators.sequential.design.design`, and its errors.
+    `gridsec.estimators.front.design.design`, and its errors.
     """
     front = front_design(plant, doubt=doubt, step_s=step_s, options=options, max_attacked=max_attacked)
     made = core.design(front, most)
@@ -195,7 +195,7 @@ class ModalState:
         Movements of the powers up to the last frame; None before the first.
     """
 
-    front: SequentialState
+    front: FrontState
     core: CoreState
     suspicion: Suspicion | None
     streak: Ints
@@ -281,8 +281,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     v2 = predicted.v2_bus[front.prior.meters]
     skew = given.clock_skew
     if skew is not None or frame.clock_offset is not None:
-        noise = np.repeat(front.white[None, :], len(front.lengths), axis=0)
-        skew = update_skew(front, skew, given.ticks, frame.clock_offset, v2, noise)
+        skew = update_skew(front, skew, frame.clock_offset, v2)
     kinds = ingest(front.references, given.attack_kinds, measured.y, measured.available)
     now = changed(
         given,
@@ -438,7 +437,7 @@ def _without_busbar(
     which: phases among those with a meter. The kept readings are replayed with a busbar voltage that is
     unknown from the onset on.
     """
-    front, kernel, modes = design.front, state.core, design.core.modes
+    kernel, modes = state.core, design.core.modes
     H = modes.model.phases(modes.at)
     named = np.zeros(H.shape[1], dtype=np.bool_)
     named[H.any(axis=0)] = which
@@ -452,7 +451,7 @@ def _without_busbar(
     now, evidence = core.again(design.core, kernel, first, unmetered)
     after = replace(
         state,
-        front=changed(state.front, busbar=_suspected_busbar(front, state.front.busbar, named)),
+        front=changed(state.front, busbar=_suspected_busbar(state.front.busbar, named)),
         core=replace(now, masked=kernel.masked),
         suspicion=None,
         phases=0 * state.phases,
@@ -461,16 +460,14 @@ def _without_busbar(
     return after, evidence
 
 
-def _suspected_busbar(front: SequentialDesign, trust: BusbarTrust, named: Bools) -> BusbarTrust:
+def _suspected_busbar(trust: BusbarTrust, named: Bools) -> BusbarTrust:
     """Trust of the busbar's meter with newly named phases, (b,); the mean of their deviation begins."""
     return replace(
         trust,
         trusted=trust.trusted & ~named,
-        scale=np.where(named, min(1, len(front.lengths) - 1), trust.scale),
         ticks_suspect=np.where(named, 0, trust.ticks_suspect),
         ticks_agreeing=np.where(named, 0, trust.ticks_agreeing),
         off=np.where(named, 0.0, trust.off),
-        named=trust.named | named,
     )
 
 
@@ -578,9 +575,7 @@ def _doubtful(kernel: CoreState) -> bool:
     return any_of(kernel.detector.pinned) or any_of(kernel.exceeding)
 
 
-def _trust(
-    design: ModalDesign, now: SequentialState, named: Bools, suspicion: Suspicion | None
-) -> SequentialState:
+def _trust(design: ModalDesign, now: FrontState, named: Bools, suspicion: Suspicion | None) -> FrontState:
     """Front end that trusts all meters but those that are named or that a likely explanation accuses."""
     trust, out = now.trust, named
     if suspicion is None and trust.clear and not any_of(named):
@@ -589,21 +584,11 @@ def _trust(
         out = named | verdict.accused(design.core, suspicion)
     if np.array_equal(trust.named, named) and np.array_equal(trust.trusted, ~out):
         return now
-    longest = len(design.front.lengths) - 1
-    return changed(
-        now,
-        trust=replace(
-            trust,
-            trusted=~out,
-            named=named,
-            scale=np.where(out, longest, trust.scale),
-            repeat_lag=np.where(named, trust.repeat_lag, 0),
-        ),
-    )
+    return changed(now, trust=replace(trust, trusted=~out, named=named))
 
 
 def _busbar(
-    design: ModalDesign, now: SequentialState, tick: _Tick, estimate: Estimate, spread: Callable[[], Floats]
+    design: ModalDesign, now: FrontState, tick: _Tick, estimate: Estimate, spread: Callable[[], Floats]
 ) -> BusbarTrust:
     """Trust of the busbar's meter: a named phase is compared with the estimate until both agree."""
     if all_of(now.busbar.trusted):
@@ -612,8 +597,7 @@ def _busbar(
     first = front.plant.feeder.busbar_places()
     v0_squared, variance = estimate.v2_bus[first], np.atleast_1d(spread()[first])
     there = measured.busbar_available & np.isfinite(variance)
-    allowed = float(front.allowed.max())
-    return track_busbar(front, now.busbar, measured.busbar_reading, there, v0_squared, variance, allowed)
+    return track_busbar(front, now.busbar, measured.busbar_reading, there, v0_squared, variance)
 
 
 def _estimate(
@@ -656,7 +640,7 @@ def _estimate(
         y=measured.y,
         trusted=sure,
         checked=partial(checked, front, measured.frame),
-        sigmas=front.sigmas[0],
+        sigmas=front.sigmas,
     )
     return Reconstructed.later(inputs, measured.frame.t, v2_bus, spread, tick.predicted.x), spread
 
@@ -683,7 +667,7 @@ def _attack(design: ModalDesign, state: ModalState, tick: _Tick, estimate: Estim
 
 
 def _checked_inverters(
-    design: ModalDesign, state: ModalState, now: SequentialState, tick: _Tick
+    design: ModalDesign, state: ModalState, now: FrontState, tick: _Tick
 ) -> InverterChecks:
     """Comparison of metered reactive powers with the droop curves."""
     before, measured, front = now.inverter_checks, tick.measured, design.front
@@ -734,7 +718,7 @@ def _kinds(
 # --- Commissioning ---
 
 
-def _gathered(design: ModalDesign, now: SequentialState, tick: _Tick, *, suspected: bool) -> Learning | None:
+def _gathered(design: ModalDesign, now: FrontState, tick: _Tick, *, suspected: bool) -> Learning | None:
     """Time of commissioning after a tick; the errors themselves are states of the filter."""
     learning, front = now.learning, design.front
     if learning is None or not now.ticks:

@@ -27,6 +27,17 @@ from scipy.linalg import lapack
 
 from gridsec.arrays import PENDING, Bools, Floats, all_of, any_of, deferred, indices
 from gridsec.estimators.detection import AGREEMENT, DecisionInputs, decide
+from gridsec.estimators.front.design import FrontDesign
+from gridsec.estimators.front.device_checks import probability
+from gridsec.estimators.front.measurements import largest_offset, unusable_offsets
+from gridsec.estimators.front.output import (
+    busbar_deviation,
+    busbar_meter,
+    clock_sentence,
+    explanations_sentence,
+    fault_sentence,
+    unread_sentence,
+)
 from gridsec.estimators.modal import detector, masking, signatures
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
@@ -37,16 +48,6 @@ from gridsec.estimators.modal.search import DOUBT
 from gridsec.estimators.modal.signatures import Onsets
 from gridsec.estimators.modal.static import Static
 from gridsec.estimators.plant import NO_VOLTAGE
-from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.device_checks import probability
-from gridsec.estimators.sequential.measurements import largest_offset, unusable_offsets
-from gridsec.estimators.sequential.output import (
-    busbar_deviation,
-    clock_sentence,
-    explanations_sentence,
-    fault_sentence,
-    unread_sentence,
-)
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, Verdict
 
 LIKELY = 0.01
@@ -254,7 +255,7 @@ def _row(state: CoreState, evidence: Evidence, suspicion: Suspicion | None) -> i
 
 
 def explanations(
-    design: SequentialDesign, core: Core, suspicion: Suspicion | None, uses_q: Bools
+    design: FrontDesign, core: Core, suspicion: Suspicion | None, uses_q: Bools
 ) -> tuple[Explanation, ...]:
     """Reported explanations, the likeliest first; sets that differ in the loads only are one.
 
@@ -322,7 +323,7 @@ def combined(
     return rivals if len(rivals) > 1 else cases
 
 
-def certain_inverters(design: SequentialDesign, core: Core, suspicion: Suspicion, uses_q: Bools) -> Bools:
+def certain_inverters(design: FrontDesign, core: Core, suspicion: Suspicion, uses_q: Bools) -> Bools:
     """Inverters without which nothing explains the readings, (m,).
 
     Parameters
@@ -335,7 +336,7 @@ def certain_inverters(design: SequentialDesign, core: Core, suspicion: Suspicion
     return np.asarray((found.weight @ ~chosen < DOUBT) & ~uses_q[design.plant.droop.customer])
 
 
-def inverter_amounts(design: SequentialDesign, core: Core, suspicion: Suspicion | None) -> Floats:
+def inverter_amounts(design: FrontDesign, core: Core, suspicion: Suspicion | None) -> Floats:
     """Injections beyond the curves in the likeliest explanation, (m,), pu."""
     out = np.zeros(design.plant.droop.tau.size)
     if suspicion is not None and suspicion.found.chosen[0].any():
@@ -366,7 +367,7 @@ def certain_phases(core: Core, suspicion: Suspicion) -> Bools:
 
 
 def share(  # noqa: PLR0917  # the core, and one report
-    design: SequentialDesign, core: Core, state: CoreState, j: int, a: float, uses_q: bool
+    design: FrontDesign, core: Core, state: CoreState, j: int, a: float, uses_q: bool
 ) -> tuple[float, float]:
     """Evidence of the voltages on meter j with a reactive power `a` beyond the curve, pu, as `Share`.
 
@@ -457,7 +458,7 @@ class Inputs:
         return all(map(all_of, every)) and not any(map(any_of, against))
 
 
-def verdict(design: SequentialDesign, now: Inputs, estimate: Estimate) -> Finding:
+def verdict(design: FrontDesign, now: Inputs, estimate: Estimate) -> Finding:
     """Decision, cause and sentence.
 
     Parameters
@@ -495,7 +496,7 @@ def verdict(design: SequentialDesign, now: Inputs, estimate: Estimate) -> Findin
     return _clock(design, now, tested, _unread_powers(design, now, estimate, finding))
 
 
-def _unvouched(design: SequentialDesign, now: Inputs, tested: Bools, finding: Finding) -> Finding:
+def _unvouched(design: FrontDesign, now: Inputs, tested: Bools, finding: Finding) -> Finding:
     """UNDECIDED where too few meters report from a phase without a busbar voltage."""
     if finding[0] is not Decision.CLEAN or all_of(now.metered):
         return finding
@@ -511,7 +512,7 @@ def _unvouched(design: SequentialDesign, now: Inputs, tested: Bools, finding: Fi
     return Decision.UNDECIDED, Cause.TOO_FEW_METERS, sentence
 
 
-def _busbar(design: SequentialDesign, now: Inputs, estimate: Estimate, finding: Finding) -> Finding:
+def _busbar(design: FrontDesign, now: Inputs, estimate: Estimate, finding: Finding) -> Finding:
     """ATTACKED where the busbar's meter is named."""
     decision, cause, reason = finding
     if not any_of(now.busbar) or cause not in (
@@ -524,11 +525,11 @@ def _busbar(design: SequentialDesign, now: Inputs, estimate: Estimate, finding: 
     v0 = estimate.v2_bus[design.plant.feeder.busbar_places()]
     off = busbar_deviation(now.busbar_off, v0, now.busbar)
     if cause is Cause.RESIDUALS:
-        return decision, cause, f"{reason[:-1]}; and the meter of the busbar."
-    return Decision.ATTACKED, Cause.RESIDUALS, f"Manipulated: the meter of the busbar; it {off}."
+        return decision, cause, f"{reason[:-1]}; and {busbar_meter(now.busbar)}."
+    return Decision.ATTACKED, Cause.RESIDUALS, f"Manipulated: {busbar_meter(now.busbar)}; it {off}."
 
 
-def with_open_cases(design: SequentialDesign, finding: Finding, cases: tuple[Explanation, ...]) -> Finding:
+def with_open_cases(design: FrontDesign, finding: Finding, cases: tuple[Explanation, ...]) -> Finding:
     """UNDECIDED where a metered reactive power leaves its curve, and the voltages do not tell why."""
     decision, cause, reason = finding
     if not cases or cause not in (Cause.AGREEMENT, Cause.SILENT_METERS, Cause.RESIDUALS):
@@ -539,7 +540,7 @@ def with_open_cases(design: SequentialDesign, finding: Finding, cases: tuple[Exp
     return Decision.UNDECIDED, Cause.AMBIGUOUS, sentence
 
 
-def _inverters(design: SequentialDesign, now: Inputs, finding: Finding) -> Finding:
+def _inverters(design: FrontDesign, now: Inputs, finding: Finding) -> Finding:
     """ATTACKED where an inverter is named."""
     decision, cause, reason = finding
     if not any_of(now.inverters) or cause in (Cause.SETTLING, Cause.DESIGN_INVALID):
@@ -552,7 +553,7 @@ def _inverters(design: SequentialDesign, now: Inputs, finding: Finding) -> Findi
     return Decision.ATTACKED, Cause.RESIDUALS, sentence
 
 
-def _suspected(design: SequentialDesign, now: Inputs, finding: Finding) -> Finding:
+def _suspected(design: FrontDesign, now: Inputs, finding: Finding) -> Finding:
     """UNDECIDED where the readings disagree and no meter is named; a sentence more where one is."""
     decision, cause, reason = finding
     if decision is Decision.ATTACKED:
@@ -578,7 +579,7 @@ def _suspected(design: SequentialDesign, now: Inputs, finding: Finding) -> Findi
     return Decision.UNDECIDED, Cause.AMBIGUOUS, explanations_sentence(design, some)
 
 
-def _doubted(design: SequentialDesign, now: Inputs, finding: Finding) -> Finding:
+def _doubted(design: FrontDesign, now: Inputs, finding: Finding) -> Finding:
     """UNDECIDED where meters exceed their class, and where readings that jump drive no inverter.
 
     The unknown injections of such inverters may hide a manipulation.
@@ -601,7 +602,7 @@ def _accuses(explanation: Explanation) -> bool:
     )
 
 
-def _one_power(design: SequentialDesign, suspicion: Suspicion, one: Explanation) -> str:
+def _one_power(design: FrontDesign, suspicion: Suspicion, one: Explanation) -> str:
     """Sentence about a single wrong power or inverter; empty where its amount is unknown."""
     found, p = suspicion.found, one.meters.size
     # Inverters follow the customers.
@@ -615,7 +616,7 @@ def _one_power(design: SequentialDesign, suspicion: Suspicion, one: Explanation)
     return ""
 
 
-def _unread_powers(design: SequentialDesign, now: Inputs, estimate: Estimate, finding: Finding) -> Finding:
+def _unread_powers(design: FrontDesign, now: Inputs, estimate: Estimate, finding: Finding) -> Finding:
     """UNDECIDED where a voltage beside an unread power is too uncertain."""
     unread = now.unread & now.seen
     if finding[1] not in (Cause.AGREEMENT, Cause.SILENT_METERS) or not any_of(unread):
@@ -632,7 +633,7 @@ def _unread_powers(design: SequentialDesign, now: Inputs, estimate: Estimate, fi
     return Decision.UNDECIDED, Cause.MISSING_POWERS, sentence
 
 
-def _clock(design: SequentialDesign, now: Inputs, tested: Bools, finding: Finding) -> Finding:
+def _clock(design: FrontDesign, now: Inputs, tested: Bools, finding: Finding) -> Finding:
     """The meters that count as silent for a clock offset beyond every scale, in the sentence."""
     decision, cause, reason = finding
     far = unusable_offsets(design, now.frame.clock_offset)

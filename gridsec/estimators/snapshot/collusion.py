@@ -29,7 +29,7 @@ import numpy as np
 from scipy.special import binom
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, submatrix
-from gridsec.estimators.sequential.posterior import solve_spd
+from gridsec.estimators.front.posterior import solve_spd
 from gridsec.estimators.snapshot.likelihood import MOST, ErrorPrior, LikelihoodProblem, SnapshotHypothesis
 
 __all__ = ["MOST", "ErrorSet", "likely_sets", "may_change"]

@@ -35,7 +35,7 @@ from scipy.linalg import lapack
 
 from gridsec import errors
 from gridsec.arrays import Bools, Floats, Ints, submatrix
-from gridsec.estimators.sequential.posterior import Prior
+from gridsec.estimators.front.posterior import Prior
 from gridsec.estimators.snapshot.collusion import ErrorSet, likely_sets, may_change
 from gridsec.estimators.snapshot.likelihood import (
     Curved,
@@ -114,7 +114,7 @@ def identify(
         none = np.zeros(0, dtype=np.bool_)
         return (_explained(ErrorSet(none, none, 0.0, m[:0], m[:0]), 1.0, available),)
     if available.all():
-        d, y, K = noise, m, prior.between
+        d, y, K = noise, m, np.asarray(prior.covariance[prior.meters])
     else:
         at = np.flatnonzero(available)
         d, y, K = noise[at], m[at], submatrix(prior.covariance, prior.meters[at], at)

@@ -26,7 +26,7 @@ from feeders.model.site import (
     unread,
 )
 from feeders.profiles import Season, library
-from feeders.registry import MODAL, SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.registry import MODAL, DesignedEstimator, choose, design
 from feeders.simulation.scenario import START, Scenario, simulate, snapshots
 from feeders.simulation.trial import Trial, frames
 from feeders.studies.campaign.guarantees import Rehearsal, rehearse
@@ -34,8 +34,9 @@ from feeders.studies.detectable import detectable
 from feeders.studies.operating import box
 from gridsec.arrays import Floats
 from gridsec.errors import InputInvalid
+from gridsec.estimators.front.measurements import frame_prior
+from gridsec.estimators.modal.monitor import ModalDesign, ModalState
 from gridsec.estimators.plant import usual
-from gridsec.estimators.sequential import SequentialDesign, SequentialState
 from tests.codes import refused
 from tests.feeders.unmetered import CIGRE, unmetered, without
 from tests.gridsec.street import ac_voltages
@@ -282,22 +283,22 @@ def test_meters_that_fall_silent_are_forecast() -> None:
 
 def test_a_told_deviation_is_believed_although_the_interval_is_wide() -> None:
     """0.5 kW of 60: the interval of the frame is seventy times as wide, and the prior is the design's own."""
-    site = choose(forecasting(CIGRE, std=0.5), estimator=SEQUENTIAL)
+    site = forecasting(CIGRE, std=0.5)
     frame = to_frame(site, silent(site, START))
     assert (frame.p_error[NOBODY] / np.sqrt(3.0) > 4.0 * load_doubt(site).p[NOBODY]).all()
     watcher, state = design(site), None
-    assert isinstance(watcher.design, SequentialDesign)
+    assert isinstance(watcher.design, ModalDesign)
     for snapshot in snapshots(simulate(site, Scenario(start=START + 216_000.0, duration_s=3.0))):
         state = watcher.init(snapshot.t) if state is None else state
         state, _, _ = watcher.step(state, to_frame(site, snapshot))
-        assert isinstance(state, SequentialState)
-        assert state.uncertainty.priors[-1] is watcher.design.prior
+        assert isinstance(state, ModalState)
+        front = watcher.design.front
+        assert frame_prior(front, state.front.uncertainty) is front.prior
 
 
-@pytest.mark.parametrize("estimator", [SEQUENTIAL, MODAL])
-def test_the_bound_holds_whatever_is_forecast(estimator: str) -> None:
+def test_the_bound_holds_whatever_is_forecast() -> None:
     """At 3 o'clock those whom nobody reads draw all that they may: within the frame's interval."""
-    watcher = design(choose(FORECAST, estimator=estimator))
+    watcher = design(FORECAST)
     at, base = CIGRE.meters, CIGRE.feeder.base_volt
     start, none = START + 10_800.0, np.full(at.size, np.nan)
     state = watcher.init(start)
@@ -306,7 +307,7 @@ def test_the_bound_holds_whatever_is_forecast(estimator: str) -> None:
         p[at] = -0.2 * CIGRE.loads.load_peak[at]
         p[NOBODY] = -CIGRE.loads.load_peak[NOBODY]
         net = 0.4 * p
-        x = (state if estimator == SEQUENTIAL else state.front).x
+        x = state.front.x
         if x is not None:
             net += CIGRE.droop.per_customer(x, p.size)
         v = ac_voltages(CIGRE.feeder, p + 1j * net, 1.0)[CIGRE.feeder.bus]
@@ -318,7 +319,7 @@ def test_the_bound_holds_whatever_is_forecast(estimator: str) -> None:
         assert (np.abs(estimate.v2 - v**2) <= estimate.bound).all()
 
 
-@pytest.mark.parametrize("estimator", [SEQUENTIAL, "weighted-least-squares", "exact-bank"])
+@pytest.mark.parametrize("estimator", [MODAL, "weighted-least-squares", "exact-bank"])
 def test_every_estimator_takes_them(estimator: str) -> None:
     """A clean noon of June: nobody is named, no number is missing."""
     site = choose(FORECAST, estimator=estimator)

@@ -19,13 +19,13 @@ from feeders.model.site import (
     load_doubt,
     to_frame,
 )
-from feeders.registry import MODAL, choose, design
+from feeders.registry import design
+from gridsec.estimators.front.design import FrontDesign
+from gridsec.estimators.front.measurements import measurements, update_uncertainty
+from gridsec.estimators.front.observer import predict
 from gridsec.estimators.modal import doubts
 from gridsec.estimators.modal.doubts import Unknown, unknown
 from gridsec.estimators.modal.monitor import ModalDesign, init
-from gridsec.estimators.sequential.design import SequentialDesign, SequentialOptions
-from gridsec.estimators.sequential.measurements import measurements, update_uncertainty
-from gridsec.estimators.sequential.step import predict
 from gridsec.interface import PowerOrigin
 from tests.feeders.model.test_forecast import forecasting
 
@@ -64,7 +64,6 @@ def test_the_deviation_is_that_of_a_first_order_process_and_of_a_switch(site: Si
     found = late(site, said(site, kw, age))
     assert found is not None
     assert found.std[site.meters[0]] == pytest.approx(expected, rel=0.005)
-    assert min(SequentialOptions().scales_s) == 0.0
 
 
 @pytest.mark.parametrize("kw", [-3.0, 0.0, 1.0, 6.0])
@@ -131,7 +130,7 @@ def test_a_stated_interval_is_in_design_and_frames_alike(site: Site) -> None:
 
 def directions(site: Site, age: float) -> tuple[ModalDesign, Unknown]:
     """Unknown directions of a first frame with powers of 1 kW of an age, s."""
-    made = design(choose(site, estimator=MODAL)).design
+    made = design(site).design
     assert isinstance(made, ModalDesign)
     front, state, frame = made.front, init(made, T).front, to_frame(site, said(site, 1.0, age))
     measured = measurements(front, frame, state.trust.trusted, state.busbar.trusted, state.v0_squared)
@@ -172,9 +171,9 @@ def test_kettles_and_cars_accuse_no_meter_once_the_age_is_stated(stated: str) ->
 
 @pytest.mark.canary("0")
 @pytest.mark.parametrize("seed", [0, 1])
-def test_kettles_and_cars_are_no_evidence_for_modal_once_the_age_is_stated(seed: int) -> None:
+def test_kettles_and_cars_are_no_evidence_once_the_age_is_stated(seed: int) -> None:
     """Loads that change by up to 11 kW within a tick; then a third of the meters is off by 3 %."""
-    seen, _, of_bound = run(seed, 300, "late", "p_interval_s", MODAL)
+    seen, _, of_bound = run(seed, 300, "late", "p_interval_s")
     assert (seen["clean"], seen["honest"]) == (seen["ticks"], 0)
     assert seen["named"] == seen["liars"]
     assert of_bound <= 1.0
@@ -183,16 +182,16 @@ def test_kettles_and_cars_are_no_evidence_for_modal_once_the_age_is_stated(seed:
 @pytest.mark.canary("1-rising")
 @pytest.mark.parametrize("how", ["fresh", "rising"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_loads_that_jump_are_no_evidence_for_modal(seed: int, how: str) -> None:
+def test_loads_that_jump_are_no_evidence(seed: int, how: str) -> None:
     """Powers of the moment: a car of 11 kW takes less reactive power than the model adds for it."""
-    seen, _, of_bound = run(seed, 240, how, "", MODAL)
+    seen, _, of_bound = run(seed, 240, how, "")
     assert (seen["clean"], seen["honest"], seen["named"]) == (seen["ticks"], 0, seen["liars"])
     assert of_bound <= 1.0
 
 
 def test_loads_jump_with_their_reported_powers(site: Site) -> None:
     """By the largest ratio of variances of a power since its last reading; not where it is metered."""
-    made = design(choose(site, estimator=MODAL)).design
+    made = design(site).design
     assert isinstance(made, ModalDesign)
     front, state = made.front, init(made, T).front
     j, root = int(made.reach[site.meters + front.customers].argmax()), np.sqrt(3.0)
@@ -204,7 +203,7 @@ def test_loads_jump_with_their_reported_powers(site: Site) -> None:
         return replace(said(site), p_kw=p, q_kvar=q)
 
     def jumps(
-        *given: float | Snapshot, h: float = 1.0, factor: float = 10.0, of: SequentialDesign = front
+        *given: float | Snapshot, h: float = 1.0, factor: float = 10.0, of: FrontDesign = front
     ) -> list[float]:
         """Variances of the jumps to all snapshots, or active powers in kW, but the first."""
         out, moved = list[float](), None

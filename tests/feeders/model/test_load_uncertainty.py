@@ -10,11 +10,13 @@ import pytest
 
 from feeders.format.tables import write
 from feeders.model.site import ALIKE, Site, from_history, from_tables, load, load_doubt, names, tell, unread
-from feeders.registry import MODAL, SEQUENTIAL, choose, design
+from feeders.registry import design
 from feeders.simulation.scenario import START
 from gridsec.errors import InputInvalid
-from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialState
-from gridsec.estimators.sequential.posterior import voltage_prior
+from gridsec.estimators.front import LoadDoubt
+from gridsec.estimators.front.measurements import frame_prior
+from gridsec.estimators.front.posterior import voltage_prior
+from gridsec.estimators.modal.monitor import ModalDesign, ModalState
 from tests.codes import refused
 from tests.feeders.unmetered import CIGRE, played, unmetered
 
@@ -94,25 +96,19 @@ def test_what_goes_up_and_down_together_moves_voltages_together() -> None:
         LoadDoubt(doubt.p, doubt.q, 1.0, together=together + 1.0)
 
 
-@pytest.mark.parametrize(("estimator", "seconds"), [(SEQUENTIAL, 3.0), (MODAL, 10.0)])
-def test_a_step_counts_what_is_not_metered_once_and_errs_by_what_it_says(
-    estimator: str, seconds: float
-) -> None:
-    """Oracle: AC power flow at 25 moments; `modal` after its observer has settled.
-
-    The prior of every step of `sequential` is the design's own.
-    """
-    site, some, ratios = choose(CIGRE, estimator=estimator), unmetered(CIGRE), []
+def test_a_step_counts_what_is_not_metered_once_and_errs_by_what_it_says() -> None:
+    """Oracle: AC power flow at 25 moments, after the observer has settled; the prior is the design's own."""
+    site, some, ratios = CIGRE, unmetered(CIGRE), []
     watcher = design(site)
     for seed in range(25):
         state = watcher.init(START)
-        for sample, frame in played(site, seed, seconds):
+        for sample, frame in played(site, seed, 10.0):
             state, estimate, verdict = watcher.step(state, frame)
             truth = (sample.v_volt / CIGRE.customer_volt) ** 2
-        if estimator == SEQUENTIAL:
-            assert isinstance(watcher.design, SequentialDesign)
-            assert isinstance(state, SequentialState)
-            assert state.uncertainty.priors[-1] is watcher.design.prior
+        assert isinstance(watcher.design, ModalDesign)
+        assert isinstance(state, ModalState)
+        front = watcher.design.front
+        assert frame_prior(front, state.front.uncertainty) is front.prior
         assert not verdict.suspects.any()
         assert estimate.std is not None
         ratios.append(((estimate.v2 - truth) / estimate.std)[some])

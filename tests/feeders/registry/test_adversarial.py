@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from feeders.model.site import Site, Snapshot, from_tables, load, load_doubt, names, plant, to_frame
-from feeders.registry import DIRECT, MODAL, SEQUENTIAL, DesignedEstimator, choose, design
+from feeders.model.site import Site, Snapshot, from_tables, load, names, plant, to_frame
+from feeders.registry import DIRECT, MODAL, DesignedEstimator, choose, design
 from feeders.simulation.plant import ClosedLoop, Loads, Point
 from feeders.simulation.powerflow import PowerFlow
-from gridsec.estimators import exact_bank, sequential
-from gridsec.estimators.sequential import SequentialDesign
+from gridsec.estimators import exact_bank
 from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
 
 JITTERS = 3.9  # standard deviations; the monitor allows for 4
@@ -24,11 +23,6 @@ JITTERS = 3.9  # standard deviations; the monitor allows for 4
 @cache
 def site(name: str) -> Site:
     return load(name)
-
-
-@cache
-def of_sequential(name: str, step_s: float) -> SequentialDesign:
-    return sequential.design(plant(site(name)), doubt=load_doubt(site(name)), step_s=step_s)
 
 
 @cache
@@ -129,9 +123,6 @@ class Watch:
         if monitor == DIRECT:
             self.step = partial(exact_bank.step, designed(name, step_s))
             self.state: Any = exact_bank.init(designed(name, step_s), world.t)
-        elif monitor == SEQUENTIAL:
-            self.step = partial(sequential.step, of_sequential(name, step_s))
-            self.state = sequential.init(of_sequential(name, step_s), world.t)
         else:
             self.step = default(name, step_s).step
             self.state = default(name, step_s).init(world.t)
@@ -148,8 +139,8 @@ class Watch:
         return verdict
 
 
-@pytest.mark.canary("900.0-simbench-lv-rural1-exact-bank", "1.0-cigre-lv-sequential", "900.0-cigre-lv-modal")
-@pytest.mark.parametrize("monitor", [DIRECT, SEQUENTIAL, MODAL])
+@pytest.mark.canary("900.0-simbench-lv-rural1-exact-bank", "900.0-cigre-lv-modal")
+@pytest.mark.parametrize("monitor", [DIRECT, MODAL])
 @pytest.mark.parametrize("name", names())
 @pytest.mark.parametrize("step_s", [1.0, 900.0])
 def test_no_alignment_of_honest_errors_is_an_attack(name: str, step_s: float, monitor: str) -> None:
@@ -175,7 +166,7 @@ SMALL = ("cigre-lv", "kerber-landnetz", "simbench-lv-rural1")
 @pytest.mark.canary("simbench-lv-rural1-exact-bank")
 @pytest.mark.parametrize(
     ("name", "monitor"),
-    [(name, DIRECT) for name in names()] + [(name, each) for name in SMALL for each in (SEQUENTIAL, MODAL)],
+    [(name, DIRECT) for name in names()] + [(name, MODAL) for name in SMALL],
 )
 def test_no_jump_between_two_readings_is_an_attack(name: str, monitor: str) -> None:
     """A tap step of 2.5 %, all loads or all the sun at once, just before a reading or long before."""
@@ -273,33 +264,24 @@ def test_wide_load_intervals_on_a_long_feeder(monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.canary(
     "cigre-lv-0.955-ends0-load-exact-bank",
     "cigre-lv-0.955-ends1-sun-exact-bank",
-    "cigre-lv-0.99-ends0-sun-sequential",
     "cigre-lv-0.99-ends0-sun-modal",
-    "cigre-lv-1.03-ends0-load-sequential",
     "cigre-lv-1.03-ends0-load-modal",
     "cigre-lv-1.03-ends1-sun-exact-bank",
     "cigre-lv-1.045-ends1-load-exact-bank",
     "kerber-landnetz-0.955-ends0-sun-exact-bank",
-    "kerber-landnetz-0.955-ends1-sun-sequential",
     "kerber-landnetz-0.955-ends1-sun-modal",
-    "kerber-landnetz-0.99-ends1-load-sequential",
     "kerber-landnetz-0.99-ends1-load-modal",
     "kerber-landnetz-1.03-ends0-sun-exact-bank",
     "kerber-landnetz-1.045-ends0-load-exact-bank",
-    "kerber-landnetz-1.045-ends1-load-sequential",
     "kerber-landnetz-1.045-ends1-load-modal",
-    "case33bw-0.955-ends0-sun-sequential",
     "case33bw-0.955-ends0-sun-modal",
-    "case33bw-0.99-ends0-load-sequential",
     "case33bw-0.99-ends0-load-modal",
     "case33bw-0.99-ends1-sun-exact-bank",
     "case33bw-1.03-ends1-load-exact-bank",
-    "case33bw-1.045-ends0-load-sequential",
     "case33bw-1.045-ends0-load-modal",
-    "case33bw-1.045-ends1-sun-sequential",
     "case33bw-1.045-ends1-sun-modal",
 )
-@pytest.mark.parametrize("monitor", [DIRECT, SEQUENTIAL, MODAL])
+@pytest.mark.parametrize("monitor", [DIRECT, MODAL])
 @pytest.mark.parametrize("jump", ["load", "sun"])
 @pytest.mark.parametrize("ends", [HIGH, LOW])
 @pytest.mark.parametrize("v0", [0.955, 0.99, 1.03, 1.045])

@@ -16,7 +16,7 @@ from gridsec.interface import Decision, Frame
 # The bank of matrix inequalities steps as the exact bank does.
 NAMES = sorted(set(FAMILIES) - {"exact-bank-lmi"})
 # These have a prior of powers that nobody knows; for all others such a power leaves everything open.
-PRIOR = {"sequential", "modal", "weighted-least-squares", "l0-decoder", "basis-pursuit", "matching-pursuit"}
+PRIOR = {"modal", "weighted-least-squares", "l0-decoder", "basis-pursuit", "matching-pursuit"}
 # These are not sure of honest readings either after so short a time.
 SLOW = {"unknown-input", "windowed-bank"}
 BEFORE, BAD, WHO = 20, 6, 2

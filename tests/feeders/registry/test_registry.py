@@ -36,7 +36,7 @@ def test_every_name_that_a_file_may_hold_has_a_family() -> None:
     assert all(family.summary for family in FAMILIES.values())
 
 
-@pytest.mark.canary("sequential", "modal", "unknown-input")
+@pytest.mark.canary("modal", "unknown-input")
 @pytest.mark.parametrize("name", [name for name in ESTIMATORS if name != LMI])
 def test_an_estimator_watches_three_phases(name: str) -> None:
     site = choose(from_tables(unbalanced(SMALL)), estimator=name)

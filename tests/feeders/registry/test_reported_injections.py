@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from feeders.model.site import Site, load, names, to_frame
-from feeders.registry import MODAL, SEQUENTIAL, choose, design
+from feeders.registry import design
 from feeders.simulation.scenario import START
 from feeders.simulation.trial import AttackKind, AttackSpec, LoadError, Trial, TrialMeterErrors, frames
 from gridsec.attack import Bias
-from gridsec.estimators import sequential
+from gridsec.estimators.modal import monitor
 from gridsec.interface import Cause, Decision, Frame, Verdict
-from tests.feeders.registry.test_adversarial import HIGH, LOW, Ends, World, of_sequential
+from tests.feeders.registry.test_adversarial import HIGH, LOW, Ends, World, default
 
 WITH_INVERTERS = [name for name in names() if load(name).droop.tau.size]
 
@@ -36,24 +36,24 @@ class Reporting(World):
 @pytest.mark.parametrize("name", WITH_INVERTERS)
 @pytest.mark.parametrize("step_s", [1.0, 900.0])
 def test_honest_errors_at_their_ends_never_accuse_an_inverter(name: str, step_s: float) -> None:
-    made = of_sequential(name, step_s)
+    made = default(name, step_s)
     for ends in (HIGH, LOW, Ends(1, 1, 1, 1)):
         for v0, load_, sun in ((0.95, 1.0, 0.0), (1.05, 0.1, 1.0)):
             for wrong in (-1.0, 1.0):
                 world = Reporting(name, ends, v0=v0, load=load_, sun=sun)
-                state = sequential.init(made, world.t)
+                state = made.init(world.t)
                 for _ in range(9 if step_s == 1.0 else 7):
                     world.run(step_s)
                     frame = to_frame(world.site, world.snapshot({}, wrong))  # type: ignore[arg-type]
                     assert np.isfinite(frame.q_net[world.site.meters]).all()
-                    state, estimate, verdict = sequential.step(made, state, frame)
+                    state, estimate, verdict = made.step(state, frame)
                     # Honest errors are taken for independent: all at their ends, they are a misfit.
                     assert verdict.cause in {Cause.AGREEMENT, Cause.SETTLING, Cause.MISFIT}
                     true = (world.now.v_volt / world.volt) ** 2
                     assert (np.abs(estimate.v2 - true) <= estimate.bound).all()
 
 
-def off_their_curves(estimator: str, count: int, liar: int | None) -> tuple[Site, set[int], Verdict]:
+def off_their_curves(count: int, liar: int | None) -> tuple[Site, set[int], Verdict]:
     """A minute of inverters off their curves and of a false meter: the last verdict, and the owners."""
     site = load("cigre-lv")
     lie = AttackSpec(AttackKind.INVERTER, count, 100.0)
@@ -61,7 +61,7 @@ def off_their_curves(estimator: str, count: int, liar: int | None) -> tuple[Site
     honest = trial.scenario
     owners = set(site.droop.customer[honest.inverter_attacks[0].inverters].tolist())
     attacks = () if liar is None else (Bias(np.array([liar]), START + 30.0, START + 90.0, np.array([0.03])),)
-    watcher = design(choose(trial.stated, estimator=estimator))
+    watcher = design(trial.stated)
     state = watcher.init(0.0)
     for frame, _ in frames(trial, replace(honest, attacks=attacks)):
         state, _, verdict = watcher.step(state, frame)
@@ -70,8 +70,8 @@ def off_their_curves(estimator: str, count: int, liar: int | None) -> tuple[Site
 
 @pytest.mark.parametrize(("count", "liar"), [(1, 2), (2, None), (2, 2)])
 def test_the_default_names_an_inverter_and_tells_of_the_other(count: int, liar: int | None) -> None:
-    """The voltages decide for one of two inverters: it is named where `sequential` is UNDECIDED."""
-    site, owners, verdict = off_their_curves(MODAL, count, liar)
+    """The voltages decide for one of two inverters."""
+    site, owners, verdict = off_their_curves(count, liar)
     assert verdict.decision is Decision.ATTACKED
     assert np.flatnonzero(verdict.suspects).tolist() == ([] if liar is None else [liar])
     named = set(site.droop.customer[verdict.inverters].tolist())
@@ -80,30 +80,9 @@ def test_the_default_names_an_inverter_and_tells_of_the_other(count: int, liar: 
     assert all(site.feeder.customers[owner] in verdict.reason for owner in owners)
 
 
-@pytest.mark.parametrize(("count", "liar"), [(1, 2), (2, None), (2, 2)])
-def test_all_are_told_of_whoever_else_lies(count: int, liar: int | None) -> None:
-    """Two inverters off their curves are both in an explanation; a named meter hides none of them."""
-    site, owners, verdict = off_their_curves(SEQUENTIAL, count, liar)
-    assert verdict.decision is (Decision.UNDECIDED if liar is None else Decision.ATTACKED)
-    assert np.flatnonzero(verdict.suspects).tolist() == ([] if liar is None else [liar])
-    # A manipulated majority of the six meters may explain the readings besides, with the named meter in it.
-    assert all(way.meters[verdict.suspects].all() for way in verdict.explanations)
-    named = set(site.droop.customer[verdict.inverters].tolist())
-    told = [
-        named | set(site.droop.customer[way.inverters].tolist()) | set(np.flatnonzero(way.powers).tolist())
-        for way in verdict.explanations
-    ]
-    few = [each for each, way in zip(told, verdict.explanations, strict=True) if way.meters.sum() <= count]
-    assert all(each == owners for each in few or [named])
-    assert all(site.feeder.customers[owner] in verdict.reason for owner in owners)
-    if told:
-        assert sum(way.probability for way in verdict.explanations) == pytest.approx(1.0, abs=0.05)
-
-
 def watched(
     name: str,
     *,
-    estimator: str | None = None,
     seed: int = 0,
     meters: TrialMeterErrors = TrialMeterErrors.SITE,
     error: LoadError | None = None,
@@ -118,7 +97,7 @@ def watched(
         lie=AttackSpec(AttackKind.INVERTER, 1, 100.0),
         report_q=True,
     )
-    watcher = design(choose(trial.stated, estimator=estimator))
+    watcher = design(trial.stated)
     state = watcher.init(0.0)
     for frame, truth in frames(trial):
         state, _, verdict = watcher.step(state, frame)
@@ -126,19 +105,14 @@ def watched(
 
 
 @pytest.mark.canary(
-    "0-sequential-cigre-lv",
-    "1-sequential-simbench-lv-rural1",
-    "0-modal-cigre-lv",
-    "1-modal-simbench-lv-rural1",
+    "0-cigre-lv",
+    "1-simbench-lv-rural1",
 )
 @pytest.mark.parametrize("name", [name for name in WITH_INVERTERS if name != "kerber-vorstadtnetz"])
-@pytest.mark.parametrize("estimator", [SEQUENTIAL, MODAL])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_an_inverter_off_its_curve_is_never_clean_and_nobody_else_is_accused(
-    name: str, estimator: str, seed: int
-) -> None:
+def test_an_inverter_off_its_curve_is_never_clean_and_nobody_else_is_accused(name: str, seed: int) -> None:
     site, since = load(name), 0
-    for _, verdict, which in watched(name, estimator=estimator, seed=seed):
+    for _, verdict, which in watched(name, seed=seed):
         assert not verdict.suspects.any()
         assert not np.delete(verdict.inverters, max(which, 0)).any()
         since += which >= 0
@@ -152,8 +126,8 @@ def test_an_inverter_off_its_curve_is_never_clean_and_nobody_else_is_accused(
             accused = set(site.droop.customer[way.inverters].tolist()) | set(
                 np.flatnonzero(way.powers).tolist()
             )
-            # `modal` also states false powers elsewhere that the voltages do not exclude, at 1 % each.
-            assert accused == {owner} or (estimator == MODAL and k and owner in accused)
+            # False powers elsewhere that the voltages do not exclude are stated, too, at 1 % each.
+            assert accused == {owner} or (k and owner in accused)
     assert since > 20
 
 
@@ -226,14 +200,14 @@ def test_nothing_of_a_replaced_meter_counts() -> None:
     site = load("cigre-lv")
     trial = Trial(site, 3, duration_s=30.0, load_error=LoadError(0.1, 0.05), report_q=True)
     c = int(site.droop.customer[1])
-    made, which = of_sequential("cigre-lv", 1.0), load("cigre-lv").meters == c
-    state = sequential.init(made, 0.0)
+    made, which = default("cigre-lv", 1.0).design, load("cigre-lv").meters == c
+    state = monitor.init(made, 0.0)
     for k, (frame, _) in enumerate(frames(trial)):
         q_net = frame.q_net.copy()
         q_net[c] += 0.5 * (10 <= k < 20)
         q_net[:] = np.nan if k >= 20 else q_net
-        state = sequential.renew(made, state, which) if k == 22 else state
-        state, _, verdict = sequential.step(made, state, replace(frame, q_net=q_net))
+        state = monitor.renew(made, state, which) if k == 22 else state
+        state, _, verdict = monitor.step(made, state, replace(frame, q_net=q_net))
         # Silence clears nobody; a new meter does.
         assert k != 21 or verdict.cause is Cause.AMBIGUOUS
     assert verdict.decision is Decision.CLEAN

@@ -433,7 +433,7 @@ def test_nothing_to_be_said_is_not_a_number() -> None:
 
 def test_a_real_family_names_exactly_the_liars() -> None:
     made = trial(AttackKind.BIAS, meters=TrialMeterErrors.REAL, load_error=LoadError(0.1, 0.05))
-    for name in ("exact-bank", "sequential"):
+    for name in ("exact-bank", "modal"):
         watcher = design(choose(made.stated, estimator=name, max_attacked=2))
         assert watcher.family is FAMILIES[name]
         out = judge(watcher, made)

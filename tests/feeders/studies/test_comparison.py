@@ -41,7 +41,7 @@ SHORT = ComparisonPlan(
     max_attacked=1,
     seeds=2,
     duration_s=90.0,
-    families=("sequential", "exact-bank"),
+    families=("modal", "exact-bank"),
     cases=("clean", "bias"),
 )
 
@@ -58,7 +58,7 @@ def test_rows_are_what_the_runs_of_one_family_add_up_to() -> None:
     told: list[str] = []
     rows = {(row.family, row.case): row for row in compare(site, SHORT, progress=told.append)}
     assert list(rows) == [(name, case) for case in SHORT.cases for name in SHORT.families]
-    assert told[:2] == ["design of sequential", "design of exact-bank"]
+    assert told[:2] == ["design of modal", "design of exact-bank"]
     bias = next(case for case in CASES if case.name == "bias")
     trials = [SHORT.trial(site, bias, seed) for seed in range(2)]
     stated = trials[0].stated
@@ -72,7 +72,7 @@ def test_rows_are_what_the_runs_of_one_family_add_up_to() -> None:
     assert row.undecided == np.mean([one.undecided.mean() for one in outcomes])
     assert row.observers == watcher.observers == 91
     assert 0.0 < row.step_ms <= row.step_ms_95
-    clean = rows["sequential", "clean"]
+    clean = rows["modal", "clean"]
     assert (clean.liars, clean.named, clean.missed, clean.reason) == (0, 0, 0, "")
     assert math.isnan(clean.false_clean)
     assert math.isnan(clean.error_liars)
@@ -88,7 +88,7 @@ def test_a_family_that_cannot_be_designed_keeps_its_row_with_the_reason() -> Non
 
 
 def test_a_lie_that_cannot_be_told_is_a_reason_too() -> None:
-    plan = replace(SHORT, max_attacked=2, seeds=1, cases=("bias",), families=("sequential",))
+    plan = replace(SHORT, max_attacked=2, seeds=1, cases=("bias",), families=("modal",))
     (row,) = compare(without_meters(load(FEEDER), 1), plan)
     assert "cannot attack 2" in row.reason
 
@@ -105,7 +105,7 @@ def test_a_family_that_fails_while_it_watches_leaves_the_others_alone(
             raise ZeroDivisionError("a defect\nof the other package")
         return made.step(prepared, state, frame)
 
-    (alone,) = compare(site, replace(plan, families=("sequential",)))
+    (alone,) = compare(site, replace(plan, families=("modal",)))
     monkeypatch.setitem(FAMILIES._known, "exact-bank", replace(made, step=step))
     row, broken = compare(site, plan)
     assert broken.reason == "failed in a step: ZeroDivisionError: a defect of the other package"
@@ -115,7 +115,7 @@ def test_a_family_that_fails_while_it_watches_leaves_the_others_alone(
 
 def test_a_plan_that_compares_nothing_is_refused_with_all_that_is_wrong() -> None:
     with refused(InputInvalid, "unknown-name", "unknown-name", "not-positive"):
-        ComparisonPlan(families=("sequential", "bank"), cases=("biass",), seeds=0)
+        ComparisonPlan(families=("modal", "bank"), cases=("biass",), seeds=0)
 
 
 def test_cases_lie_as_they_say() -> None:
@@ -138,10 +138,10 @@ def test_cases_lie_as_they_say() -> None:
 
 ROWS = [
     ComparisonRow(
-        "sequential", "clean", "", 0, 0, 0, 0, 0.0, math.nan, math.nan, 0.1, 0.4, 2.0, 1, math.nan, 0.01
+        "modal", "clean", "", 0, 0, 0, 0, 0.0, math.nan, math.nan, 0.1, 0.4, 2.0, 1, math.nan, 0.01
     ),
     ComparisonRow("exact-bank", "clean", "too few | meters,\n 2 of 5"),
-    ComparisonRow("sequential", "bias", "", 6, 5, 1, 2, 0.1, 4.0, 0.25, math.inf, 0.4, 2.0, 1, 0.5, 0.01),
+    ComparisonRow("modal", "bias", "", 6, 5, 1, 2, 0.1, 4.0, 0.25, math.inf, 0.4, 2.0, 1, 0.5, 0.01),
     ComparisonRow("exact-bank", "bias", "too few | meters,\n 2 of 5"),
 ]
 
@@ -168,7 +168,7 @@ def test_a_row_becomes_cells() -> None:
 def test_markdown_has_a_row_for_every_family_in_every_table() -> None:
     overview, *single = tables(markdown(ROWS, SHORT))
     assert overview[0] == ["family", "clean", "bias"]
-    assert overview[1] == ["sequential", "0/0 (0)", "5/6 (2)"]
+    assert overview[1] == ["modal", "0/0 (0)", "5/6 (2)"]
     assert overview[3] == ["exact-bank", "none", "none"]
     for table in (overview, *single):
         assert tuple(row[0] for row in table[1:]) == tuple(FAMILIES)

@@ -20,7 +20,7 @@ from feeders.studies.operating import volts_of_lie
 from feeders.studies.running import Here, Processes
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import InputInvalid
-from gridsec.estimators.sequential.meter_bias import Commission
+from gridsec.estimators.front import Commission
 from gridsec.interface import Decision
 from gridsec.planning.detectability import HONEST, INITIAL, ROOM, MonitorTests
 from tests.codes import refused

@@ -214,7 +214,7 @@ def test_simulated_lies_go_on_and_more_of_them_too(tmp_path: Path) -> None:
 
 def test_a_comparison_goes_on(tmp_path: Path) -> None:
     plan = ComparisonPlan(
-        max_attacked=1, seeds=1, duration_s=80.0, families=("sequential",), cases=("clean", "bias", "stuck")
+        max_attacked=1, seeds=1, duration_s=80.0, families=("modal",), cases=("clean", "bias", "stuck")
     )
     journal, said = tmp_path / "journal", list[str]()
 

@@ -13,7 +13,7 @@ from gridsec.arrays import Bools, Floats
 from gridsec.errors import InputInvalid
 from gridsec.estimators import distributed
 from gridsec.estimators.distributed import Area, Concentrator, Message, exchange, laterals, partition, verdict
-from gridsec.estimators.sequential.posterior import LoadDoubt, voltage_prior
+from gridsec.estimators.front.posterior import LoadDoubt, voltage_prior
 from gridsec.grid.radial import Feeder
 from gridsec.interface import Decision
 

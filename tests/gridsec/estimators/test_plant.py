@@ -10,9 +10,9 @@ import pytest
 from scipy.special import ndtr
 
 from gridsec.errors import InputInvalid
-from gridsec.estimators import exact_bank, partial, sequential, set_search, unknown_input
+from gridsec.estimators import exact_bank, front, partial, set_search, unknown_input
+from gridsec.estimators.front import FrontOptions, LoadDoubt
 from gridsec.estimators.plant import Options, Plant
-from gridsec.estimators.sequential import LoadDoubt, SequentialOptions
 from gridsec.grid.devices import steady_rounding
 from tests.codes import refused
 from tests.gridsec.street import accuracy, make_plant
@@ -50,10 +50,10 @@ def test_all_problems_are_named_at_once(family: ModuleType, step_s: float) -> No
         family.design(wrong, max_attacked=-1, step_s=step_s)
 
 
-def test_the_sequential_monitor_asks_the_same_of_a_plant() -> None:
+def test_the_front_end_asks_the_same_of_a_plant() -> None:
     wrong = replace(street(), meters=np.array([-1, 3, 3]))
     with refused(InputInvalid, "unknown-index", "duplicate", "shape", "not-integer", "not-positive", "shape"):
-        sequential.design(wrong, doubt=LoadDoubt(np.ones(3), np.ones(3), 1.0), step_s=np.nan, max_attacked=-1)
+        front.design(wrong, doubt=LoadDoubt(np.ones(3), np.ones(3), 1.0), step_s=np.nan, max_attacked=-1)
 
 
 def test_numbers_of_one_family_are_named_with_the_others() -> None:
@@ -81,25 +81,26 @@ def test_options_that_would_name_everybody_or_nobody_are_refused() -> None:
     Options(sigmas=0.0, confirm=1, release=1, settled=1.0, tie=0.0, widest=np.inf)
 
 
-def test_options_of_the_sequential_monitor_are_checked_alike() -> None:
+def test_options_of_the_front_end_are_checked_alike() -> None:
     wrong = {
-        "alarms_per_year": 0.0, "scales_s": (np.nan,), "enough": 0.0, "focus": np.nan, "several": -1,
-        "release": 0, "suspect": 1.0, "lower": np.nan, "like": 0.5, "hidden_power": 0.0,
-        "hidden_charge": np.nan, "commission_s": np.nan, "stability": -0.1, "widest": np.nan,
-        "v2_limits": (np.nan, 1.0), "settled": np.nan,
+        "alarms_per_year": 0.0, "enough": 0.0, "release": 0, "suspect": 1.0, "lower": np.nan, "like": 0.5,
+        "hidden_power": 0.0, "commission_s": np.nan, "stability": -0.1, "unread_std_percent": -1.0,
+        "largest_offset_s": -1.0,
+        "widest": np.nan, "v2_limits": (np.nan, 1.0), "settled": np.nan,
     }  # fmt: skip
     with pytest.raises(InputInvalid) as caught:
-        SequentialOptions(**wrong)  # type: ignore[arg-type]
+        FrontOptions(**wrong)  # type: ignore[arg-type]
     found = {
         problem.split()[0]: code
         for problem, code in zip(caught.value.problems, caught.value.codes, strict=True)
     }
     assert found == {
-        "alarms_per_year": "not-positive", "scales_s": "out-of-range", "enough": "out-of-range",
-        "focus": "not-positive", "several": "negative", "release": "out-of-range", "suspect": "out-of-range",
-        "lower": "out-of-range", "like": "out-of-range", "hidden_power": "not-positive",
-        "hidden_charge": "negative", "commission_s": "negative", "stability": "negative",
-        "widest": "not-positive", "v2_limits": "order", "settled": "out-of-range",
+        "alarms_per_year": "not-positive", "enough": "out-of-range", "release": "out-of-range",
+        "suspect": "out-of-range", "lower": "out-of-range", "like": "out-of-range",
+        "hidden_power": "not-positive", "commission_s": "negative", "stability": "negative",
+        "unread_std_percent": "negative",
+        "largest_offset_s": "negative", "widest": "not-positive", "v2_limits": "order",
+        "settled": "out-of-range",
     }  # fmt: skip
 
 

@@ -19,12 +19,20 @@ from scipy.stats import chi2, norm
 
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import DesignInfeasible, NotObservable
-from gridsec.estimators import sequential, single_tick
+from gridsec.estimators import single_tick
+from gridsec.estimators.front import LoadDoubt
+from gridsec.estimators.front.posterior import condition, leave_one_out, voltage_prior
 from gridsec.estimators.plant import Plant
-from gridsec.estimators.sequential import LoadDoubt, SequentialDesign, SequentialState
-from gridsec.estimators.sequential.posterior import condition, leave_one_out, voltage_prior
-from gridsec.estimators.sequential.search import Decoder, DecoderInput, Limits
-from gridsec.estimators.single_tick import fewest, least_squares, match, pursue
+from gridsec.estimators.single_tick import (
+    Decoder,
+    SingleTickDesign,
+    SingleTickState,
+    fewest,
+    least_squares,
+    match,
+    pursue,
+)
+from gridsec.estimators.single_tick.decoders import DecoderInput, Limits
 from gridsec.interface import Cause, Decision, Estimate, Frame, Verdict
 from gridsec.secure.decode.gaussian import design_test, detect
 from gridsec.secure.decode.stacks import Stack
@@ -67,7 +75,7 @@ def bench(rng: np.random.Generator, p: int = 8, sigmas: float = 3.5, most: int =
     A = np.hstack([2.0 * R * P_STD, 2.0 * X * Q_STD, np.full((p, 1), BUSBAR)])
     doubt = LoadDoubt(np.full(p, P_STD), np.full(p, Q_STD), 600.0)
     before = voltage_prior(tree, np.arange(1, p + 1), doubt, busbar=BUSBAR)
-    none, zeros = np.zeros(p, dtype=bool), np.zeros(p)
+    zeros = np.zeros(p)
 
     def evidence(m: Floats, live: Bools | None = None) -> DecoderInput:
         seen = np.ones(p, dtype=bool) if live is None else live
@@ -76,10 +84,7 @@ def bench(rng: np.random.Generator, p: int = 8, sigmas: float = 3.5, most: int =
             m=m,
             available=seen,
             limits=Limits(sigmas, zeros, zeros, zeros),
-            trusted=seen,
-            above_limit=none,
             max_attacked=most,
-            like=100.0,
         )
 
     loads = A.shape[1]
@@ -258,7 +263,7 @@ def test_a_meter_without_a_reading_has_no_influence_and_is_not_accused(decoder: 
     assert not empty[0].meters.any()
 
 
-def prepare(plant: Plant, decoder: Decoder, *, step_s: float = 1.0, most: int = 2) -> SequentialDesign:
+def prepare(plant: Plant, decoder: Decoder, *, step_s: float = 1.0, most: int = 2) -> SingleTickDesign:
     """For the street's loads: p metered within 1 %, power factors known within limits."""
     n = len(plant.feeder.customers)
     doubt = LoadDoubt(np.full(n, 0.03 / BASE_KVA), np.full(n, 0.6 / BASE_KVA), 600.0, common_q=0.5)
@@ -267,22 +272,22 @@ def prepare(plant: Plant, decoder: Decoder, *, step_s: float = 1.0, most: int = 
 
 def watch(
     street: Street,
-    design: SequentialDesign,
+    design: SingleTickDesign,
     frames: int,
     *,
     h: float = 1.0,
-    state: SequentialState | None = None,
+    state: SingleTickState | None = None,
     lies: dict[int, float] | None = None,
     silent: tuple[int, ...] = (),
     change: Callable[[Frame], Frame] = lambda frame: frame,
-) -> tuple[SequentialState, list[tuple[Estimate, Verdict]]]:
+) -> tuple[SingleTickState, list[tuple[Estimate, Verdict]]]:
     """Run a street; check on every frame what must always hold."""
-    state = sequential.init(design, street.t) if state is None else state
+    state = single_tick.init(design, street.t) if state is None else state
     answers = []
     for _ in range(frames):
         street.advance(h)
         frame = change(street.frame(lies, silent))
-        state, estimate, verdict = sequential.step(design, state, frame)
+        state, estimate, verdict = single_tick.step(design, state, frame)
         for values in (estimate.v2, estimate.bound, estimate.std, verdict.threshold, verdict.attack):
             assert np.isfinite(values).all()
         assert (estimate.std > 0).all()
@@ -365,19 +370,19 @@ class TestOnStreets:
         rng = np.random.default_rng(5)
         plant = make_plant(rng)
         design = prepare(plant, decoder)
-        start = sequential.init(design, 1000.0)
+        start = single_tick.init(design, 1000.0)
         street = Street(plant, rng)
         street.advance(1.0)
         frame = street.frame(silent=(3,))
-        _, estimate, verdict = sequential.step(design, start, frame)
+        _, estimate, verdict = single_tick.step(design, start, frame)
         for junk in (np.nan, np.inf):
             y = np.where(np.arange(9) == 3, junk, frame.y)
             broken = replace(frame, y=y, seen=np.ones(9, dtype=bool))
-            _, again, said = sequential.step(design, start, broken)
+            _, again, said = single_tick.step(design, start, broken)
             np.testing.assert_array_equal(again.v2, estimate.v2)
             assert (said.decision, said.cause) == (verdict.decision, verdict.cause)
         hidden = replace(frame, y=np.where(frame.seen, frame.y, 1.3))
-        np.testing.assert_array_equal(sequential.step(design, start, hidden)[1].v2, estimate.v2)
+        np.testing.assert_array_equal(single_tick.step(design, start, hidden)[1].v2, estimate.v2)
 
     def test_a_frame_that_is_not_later_changes_nothing(self, decoder: Decoder) -> None:
         rng = np.random.default_rng(6)
@@ -385,7 +390,7 @@ class TestOnStreets:
         design, street = prepare(plant, decoder), Street(plant, rng)
         state, answers = watch(street, design, 20)
         for t in (street.t, street.t - 5.0, np.nan):
-            again, estimate, verdict = sequential.step(design, state, replace(street.frame(), t=t))
+            again, estimate, verdict = single_tick.step(design, state, replace(street.frame(), t=t))
             assert again is state
             assert verdict.decision is Decision.UNDECIDED
             np.testing.assert_array_equal(estimate.v2, answers[-1][0].v2)

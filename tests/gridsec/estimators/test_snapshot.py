@@ -11,7 +11,7 @@ from scipy.special import betaln
 
 from gridsec.arrays import Bools, Floats
 from gridsec.errors import InputInvalid
-from gridsec.estimators.sequential.posterior import Prior
+from gridsec.estimators.front.posterior import Prior
 from gridsec.estimators.snapshot.collusion import _SamePowers
 from gridsec.estimators.snapshot.identification import (
     ErrorPrior,

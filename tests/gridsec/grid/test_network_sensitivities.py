@@ -39,11 +39,5 @@ def test_numbers_are_active_powers_first(name: str, kept: bool, monkeypatch: pyt
         np.testing.assert_allclose(
             sensitivities.columns(power, which % count), own[:, which % count], atol=1e-12
         )
-    # Few customers, or most of them.
-    for some in (rng.choice(count, 1), rng.permutation(count)):
-        weights = rng.standard_normal(some.size)
-        np.testing.assert_allclose(
-            sensitivities.weighted(some, weights), weights @ expected[feeder.bus[some]], rtol=1e-9, atol=1e-12
-        )
     at = rng.choice(places, 2)
     np.testing.assert_allclose(np.hstack(list(sensitivities.rows(at))), expected[at], atol=1e-12)

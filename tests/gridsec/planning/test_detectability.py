@@ -11,12 +11,12 @@ import pytest
 from scipy.optimize import linprog
 
 from gridsec.arrays import Bools, Floats
+from gridsec.estimators.front.posterior import LoadDoubt
 from gridsec.estimators.modal import classes, core, monitor, rivals, signatures
 from gridsec.estimators.modal.core import Core, CoreState
 from gridsec.estimators.modal.costs import SearchProblem, cost
 from gridsec.estimators.modal.search import DOUBT
 from gridsec.estimators.plant import Plant
-from gridsec.estimators.sequential.posterior import LoadDoubt
 from gridsec.grid.devices import MeterAccuracy, fleet
 from gridsec.planning.collusion import furthest
 from gridsec.planning.detectability import (

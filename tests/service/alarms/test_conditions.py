@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 
-from gridsec.estimators.sequential import LearningReason
+from gridsec.estimators.front import LearningReason
 from gridsec.interface import Cause
 from service.alarms.state_machine import (
     AlarmBook,

@@ -80,7 +80,7 @@ def test_wrong_usage_of_design_is_told_at_once(
     wrong = ("--estimator", "zz", "--max-attacked", "-1")
     code, _, told = run(monkeypatch, capsys, "design", "cigre-lv", *wrong)
     assert code == 2
-    assert "--estimator is 'zz'; expected one of sequential, " in plain(told)
+    assert "--estimator is 'zz'; expected one of modal, " in plain(told)
     assert "--max-attacked is -1; it must not be negative" in plain(told)
 
 

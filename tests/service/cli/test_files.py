@@ -90,7 +90,7 @@ def test_options_are_stronger_than_the_files(
         "--step",
         "1",
         "--estimator",
-        "sequential",
+        "modal",
         "--alarms-per-year",
         "1",
         *KNOWN,
@@ -101,7 +101,7 @@ def test_options_are_stronger_than_the_files(
     assert code == 0
     for said in (
         "one every 1 s (--step)",
-        "monitored by sequential (--estimator)",
+        "monitored by modal (--estimator)",
         "a year: 1 (--alarms-per-year)",
         "within 0.1 kW and 0.05 kvar, medians of 1 sigma (--load-error-kw, --load-error-kvar)",
     ):

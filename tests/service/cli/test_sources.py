@@ -213,7 +213,7 @@ def test_a_report_tells_what_was_not_carried_over(
         (("--scenarios", "2", "--duration", "30", "--workers", "1"), command("study", "campaign")),
         (("--compare", "vde4105", "--preset", "vde4105", "--who", "all"),
          command("study", "droop")),
-        (("--case", "clean", "--family", "sequential", "--seeds", "1", "--duration", "70"),
+        (("--case", "clean", "--family", "modal", "--seeds", "1", "--duration", "70"),
          command("study", "compare")),
     ],
     ids=["protect", "campaign", "droop", "compare"],

@@ -29,16 +29,16 @@ def test_numbers_go_to_the_screen_to_a_file_and_into_a_document(
 ) -> None:
     page, numbers = tmp_path / "page.md", tmp_path / "numbers.csv"
     page.write_text(f"# Mine\n{BEGIN}\nold\n{END}\nkept\n", encoding="utf-8")
-    names = ("--family", "sequential", "--family", "exact-bank")
+    names = ("--family", "modal", "--family", "exact-bank")
     code, told, _ = run(
         monkeypatch, capsys, "compare", *QUICK, *names, "--csv", str(numbers), "--write", str(page)
     )
     assert code == 0
     assert "bias: readings of 1 meter at random" in told
-    assert row(told, "sequential")[1:4] == ["1 of 1", "0", "0"]
+    assert row(told, "modal")[1:4] == ["1 of 1", "0", "0"]
     with numbers.open(newline="", encoding="utf-8") as file:
         read = {line["family"]: line for line in csv.DictReader(file)}
-    assert list(read) == ["sequential", "exact-bank"]
+    assert list(read) == ["modal", "exact-bank"]
     assert read["exact-bank"]["observers"] == row(told, "exact-bank")[8] == "91"
     text = page.read_text(encoding="utf-8")
     assert text.startswith("# Mine\n")
@@ -46,7 +46,7 @@ def test_numbers_go_to_the_screen_to_a_file_and_into_a_document(
     assert "old" not in text
     assert "13 meters (errors: site), 9 inverters, M = 1, one run of 80 s at 1 s per case" in text
     command = "gridsec study compare simbench-lv-rural1 --max-attacked 1 --seeds 1 --duration 80"
-    assert f"    {command} --family sequential --family exact-bank --case bias\n" in text
+    assert f"    {command} --family modal --family exact-bank --case bias\n" in text
     assert text.count("| exact-bank |") == 2
     assert text.count("not run") == len(FAMILIES) - 2
 
@@ -83,7 +83,7 @@ def test_a_family_that_is_refused_tells_why(
 @pytest.mark.parametrize(
     ("wrong", "hint"),
     [
-        (("--family", "oracle"), "sequential"),
+        (("--family", "oracle"), "modal"),
         (("--case", "bribe"), "coordinated-power"),
         (("--meters", "perfect"), "white"),
         (("--seeds", "0"), "1"),

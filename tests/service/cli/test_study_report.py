@@ -178,7 +178,7 @@ def test_every_option_of_a_report_belongs_to_a_study() -> None:
     others = {"feeder", "workers"}
     given: dict[str, Any] = {
         "max_attacked": 1, "goal": "contain", "lie_volt": 2.0, "unknown": ("a",), "silent": ("b",),
-        "busbar_unknown": True, "scenarios": 3, "seed": 4, "step": 5.0, "estimator": "sequential",
+        "busbar_unknown": True, "scenarios": 3, "seed": 4, "step": 5.0, "estimator": "modal",
         "load_error_kw": 1.0, "load_error_kvar": 1.0, "preset": "vde4105", "busbar": (0.9, 1.0),
         "band": (0.9, 1.1), "hosting": True, "readings": Path("day.csv"),
     }  # fmt: skip

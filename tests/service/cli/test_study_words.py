@@ -170,7 +170,7 @@ def test_calibrate(given: Given, tmp_path: Path) -> None:
 
 def test_compare(given: Given, tmp_path: Path) -> None:
     numbers = tmp_path / "numbers.csv"
-    names = ("--family", "sequential", "--family", "weighted-least-squares")
+    names = ("--family", "modal", "--family", "weighted-least-squares")
     cases = ("--case", "bias", "--case", "clean", "--seeds", "1", "--duration", "80", "--csv", str(numbers))
     ran = Ran(*given, "compare", "cigre-lv", *names, *cases)
     sums = pd.read_csv(numbers).groupby("family")[["named", "liars", "falsely_named"]].sum()

@@ -23,7 +23,8 @@ from feeders.format.tables import write
 from feeders.model.site import Site, from_tables, load
 from feeders.simulation.scenario import Scenario, SimulatedReading, by_arrival, simulate
 from gridsec.attack import Scaling
-from gridsec.estimators.sequential import Commission, LearningReason, LearningState, to_arrays
+from gridsec.estimators.front import Commission, LearningReason, LearningState
+from gridsec.estimators.front.meter_bias import to_arrays
 from service.alarms.state_machine import Alarm, AlarmKind, AlarmState, Severity
 from service.cli.simulate import Pace, key_of, payload_of, play
 from service.engine.commissioning import FeederCommissioning, NothingToLearn, Stage

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from feeders.model.site import Site, from_tables, load
-from feeders.registry import MODAL, SEQUENTIAL, choose
 from feeders.simulation.scenario import Scenario, SimulatedReading, by_arrival, simulate
 from gridsec.arrays import Floats
 from service.engine.engine import Engine, RuntimeConfig
@@ -33,9 +32,9 @@ END = 25
 """End of the first service, s after the beginning."""
 
 
-def watched(estimator: str) -> Site:
+def watched() -> Site:
     """A feeder with slow inverters: a start takes about ten seconds."""
-    tables = choose(load(FEEDER), estimator=estimator).tables
+    tables = load(FEEDER).tables
     rows = (replace(row, tau_s=TAU_S if row.inverter_kva else None) for row in tables.customers)
     return from_tables(replace(tables, customers=tuple(rows)))
 
@@ -43,7 +42,7 @@ def watched(estimator: str) -> Site:
 @pytest.fixture(scope="module")
 def readings() -> list[SimulatedReading]:
     scenario = Scenario(seed=2, start=START, duration_s=END + 30.0)
-    return list(by_arrival(simulate(watched(SEQUENTIAL), scenario)))
+    return list(by_arrival(simulate(watched(), scenario)))
 
 
 def feed(live: Engine, some: list[Sample]) -> None:
@@ -60,12 +59,12 @@ def watching(store: Store, site: Site) -> tuple[Engine, Told]:
     return made, told
 
 
-@pytest.fixture(scope="module", params=[SEQUENTIAL, MODAL])
+@pytest.fixture(scope="module")
 def killed(
-    request: pytest.FixtureRequest, readings: list[SimulatedReading], tmp_path_factory: pytest.TempPathFactory
+    readings: list[SimulatedReading], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Site, Told]:
     """Database of a service that was killed, its feeder, and what it published."""
-    site, folder = watched(request.param), tmp_path_factory.mktemp("killed")
+    site, folder = watched(), tmp_path_factory.mktemp("killed")
     with Store(f"sqlite:///{folder}/s.db") as store:
         live, told = watching(store, site)
         feed(live, samples(readings, 0, END))
@@ -163,7 +162,7 @@ def test_an_observer_is_stored_a_few_times_per_settling(
     readings: list[SimulatedReading], tmp_path: Path
 ) -> None:
     """And the newest one at the end."""
-    site, times = watched(SEQUENTIAL), []
+    site, times = watched(), []
     with Store(f"sqlite:///{tmp_path}/s.db") as store:
         live, told = watching(store, site)
         add = live.committer.waiting.add

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from feeders.model.site import Site, load
-from feeders.registry import MODAL, SEQUENTIAL, choose
+from feeders.registry import MODAL, choose
 from feeders.simulation.plant import Channel
 from feeders.simulation.scenario import Scenario, SimulatedReading, by_arrival, simulate
 from gridsec.attack import Scaling
+from gridsec.estimators.modal import record
 from gridsec.estimators.modal.monitor import ModalCommission
 from service.alarms.state_machine import AlarmKind
 from service.engine.commissioning import Stage
@@ -150,12 +152,26 @@ def test_a_replaced_meter_is_trusted_after_a_restart(
         assert told.suspects(0) == (LIARS[0], LIARS[2])
 
 
-def test_the_record_of_another_estimator_begins_learning_anew(
+def test_a_record_of_a_removed_estimator_keeps_the_suspects(
     site: Site, readings: list[SimulatedReading], left: str
 ) -> None:
-    """Learned errors of `modal` are not those of `sequential`; named meters stay suspects."""
+    """State that `sequential` stored before its removal: learning begins anew, named meters stay suspects."""
     with Store(left) as store:
-        live, told = watching(store, choose(site, estimator=SEQUENTIAL))
+        learned, suspects = store.commission(FEEDER), store.distrust(FEEDER)
+        assert learned is not None
+        assert suspects is not None
+        text = json.loads(learned.text)
+        text["fingerprint"]["estimator"] = "0" * 32
+        # Its own arrays are those of the time of commissioning; the record of the filter is of `modal`.
+        text["arrays"] = {name: each for name, each in text["arrays"].items() if not record.is_own(name)}
+        before = json.loads(suspects.text)
+        before["meters"] = [meter | {"scale_s": 15.0, "repeats_s": 100.0} for meter in before["meters"]]
+        before["meters"].append({"meter": "m00", "scale_s": 5.0, "named": False, "repeats_s": None})
+        before["busbar"] = [{"phase": None, "scale_s": 60.0, "named": False, "off": 0.0}]
+        changed = [replace(learned, text=json.dumps(text)), replace(suspects, text=json.dumps(before))]
+        store.commit(kept=changed)
+    with Store(left) as store:
+        live, told = watching(store, site)
         feed(live, samples(readings, END_S, END_S + 4.0))
         progress = live.monitors[FEEDER].commissioning.progress()
         assert (progress.state, progress.restored) == (Stage.LEARNING, False)

@@ -228,7 +228,7 @@ def test_a_shed_feeder_that_is_put_again_stays_shed(pair: Pair) -> None:
     pair.run(16)
     assert (pair.cause(), pair.standing()) == (Cause.OVERLOAD, {(AlarmKind.UNDECIDED, None)})
     pair.shed()
-    # The observer settles, one tick later than with `sequential`; the alarm clears 5 s after that.
+    # The observer settles; the alarm clears 5 s after that.
     pair.run(10)
     assert pair.cause() is not Cause.OVERLOAD
     assert pair.standing() == set()

@@ -18,7 +18,7 @@ from feeders.simulation.recording import read_recording
 from feeders.simulation.scenario import Scenario, by_arrival, simulate
 from feeders.simulation.scenario import SimulatedReading as Said
 from gridsec.attack import Bias
-from gridsec.estimators.sequential import SuspicionRecord
+from gridsec.estimators.front import SuspicionRecord
 from gridsec.interface import Cause, Decision, Estimate, Explanation, Verdict
 from service.alarms.conditions import AlarmKind, Condition, Severity, conditions
 from service.alarms.state_machine import AlarmBook, Change

@@ -75,7 +75,7 @@ def tight(site: Site, v_max_pu: float) -> Site:
 @pytest.mark.parametrize(
     ("estimator", "judges", "uses_one"),
     [
-        ("sequential", True, True),
+        ("modal", True, True),
         ("weighted-least-squares", True, True),
         ("set-search", False, True),
         # No observer of this bank runs on one meter.

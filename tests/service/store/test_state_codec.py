@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from feeders.model.site import Site, from_tables, load
-from gridsec.estimators.sequential import ObserverRecord, SuspicionRecord
+from gridsec.estimators.front import ObserverRecord, SuspicionRecord
 from service.store.state_codec import (
     FORMAT,
     KeptInvalid,

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import APIResponse, Route, expect
 
 from gridsec.estimators.data_errors import DataErrorKind
-from gridsec.estimators.sequential import LearningReason, LearningState
+from gridsec.estimators.front import LearningReason, LearningState
 from gridsec.interface import Cause
 from service.alarms.state_machine import AlarmState, AlarmTransition, Change
 from service.report.data_errors import DataErrorReport

@@ -17,7 +17,7 @@ from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.radial import Feeder
 from gridsec.interface import Cause, Decision, Estimate, Verdict
 from gridsec.observers.lure import close_loop
-from tests.gridsec.estimators.sequential.test_phases import CUSTOMERS, apart, together
+from tests.gridsec.estimators.modal.test_phases import CUSTOMERS, apart, together
 from tests.gridsec.street import Street, make_plant
 from tests.gridsec.streets import PhasedStreet, coupled, errors_at_their_ends
 

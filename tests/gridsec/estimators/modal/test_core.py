@@ -1,4 +1,4 @@
-"""Model of a designed feeder, and the core beside the default monitor."""
+"""Model of a designed feeder, and the core on its residuals."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from benchmarks._residuals import Source, model_of, power_columns, tree
-from gridsec.estimators import sequential
+from gridsec.estimators.front import FrontDesign
 from gridsec.estimators.modal import core
 from gridsec.estimators.modal.model import REPORTED_S, modes, residual_model
-from gridsec.estimators.sequential import SequentialDesign
-from tests.gridsec.estimators.sequential.test_monitor import prepare
+from tests.gridsec.estimators.modal.streets import front_end
 from tests.gridsec.street import Street, make_plant
 
 MODEL = model_of(tree(12, np.random.default_rng(3)))
@@ -21,10 +20,10 @@ LIAR = 4
 STEPS = power_columns(tree(12, np.random.default_rng(3)))[:, :12]
 
 
-def front(customers: int = 12) -> tuple[SequentialDesign, Street]:
+def front(**options: np.ndarray) -> tuple[FrontDesign, Street]:
     """A designed street and its truth."""
-    plant = make_plant(np.random.default_rng(5), customers=customers, drop=0.03)
-    return prepare(plant), Street(plant, np.random.default_rng(6))
+    plant = make_plant(np.random.default_rng(5), customers=12, drop=0.03, **options)
+    return front_end(plant), Street(plant, np.random.default_rng(6))
 
 
 def test_modes_diagonalise_the_model() -> None:
@@ -42,7 +41,7 @@ def test_modes_diagonalise_the_model() -> None:
 
 
 def test_the_model_is_that_of_the_front_end() -> None:
-    """Loads with the busbar are the prior of the default monitor."""
+    """Loads with the busbar are the prior of the front end."""
     made, _ = front()
     model = residual_model(made)
     with_busbar = model.of_meters + model.busbar
@@ -90,19 +89,16 @@ def test_modes_need_a_member_and_gamma_is_at_least_1() -> None:
         core.estimate(kernel, core.init(kernel, 0.0))
 
 
-def test_beside_the_default_monitor() -> None:
+def test_on_the_residuals_of_a_street() -> None:
     """AC power flow: no alarm without a lie; a lie of 3 % is named at once, and the voltage is put right."""
-    made, street = front()
-    kernel = core.design(made)
-    state, mine = sequential.init(made, street.t), None
+    made, street = front(inverters=np.zeros(0, dtype=np.intp))
+    kernel, mine, feeder = core.design(made), None, made.plant.feeder
     for k in range(120):
         street.advance(1.0)
-        lies = {LIAR: 0.03} if k >= 100 else None
-        frame = street.frame(lies)
-        state, _, _ = sequential.step(made, state, frame)
+        frame = street.frame({LIAR: 0.03} if k >= 100 else None)
+        v2 = feeder.bus_voltages(frame.p, frame.q, frame.v0_squared, steps=made.plant.loss_correction)
         mine = core.init(kernel, frame.t) if mine is None else mine
-        m, seen = core.residuals(state)
-        mine, evidence = core.step(kernel, mine, frame.t, m, seen)
+        mine, evidence = core.step(kernel, mine, frame.t, frame.y - v2[made.prior.meters])
         assert k >= 100 or not core.alarmed(kernel, evidence)
     assert core.alarmed(kernel, evidence)
     suspicion = core.identify(kernel, mine, evidence)
@@ -113,23 +109,6 @@ def test_beside_the_default_monitor() -> None:
     assert abs(right.mean[place]) < 0.1 * lie
     assert abs(plain.mean[place]) > abs(right.mean[place])
     assert right.variance[place] > plain.variance[place]
-
-
-def test_residuals_hold_the_fixed_errors() -> None:
-    """Readings minus the model, whether or not fixed errors are learned; zero where not seen."""
-    made, street = front()
-    state = sequential.init(made, street.t)
-    street.advance(1.0)
-    frame = street.frame(None, (2,))
-    state, _, _ = sequential.step(made, state, frame)
-    m, seen = core.residuals(state)
-    assert seen.tolist() == [k != 2 for k in range(12)]
-    assert m[2] == 0.0
-    bias = np.full(12, 1e-3)
-    learned = replace(state.learned, bias=bias)
-    other = sequential.init(made, street.t, learned)
-    other, _, _ = sequential.step(made, replace(other, t=state.t - 1.0), frame)
-    assert np.allclose(core.residuals(other)[0][seen], m[seen], atol=1e-9)
 
 
 def test_a_suspected_onset_is_kept_and_given_up() -> None:

@@ -8,17 +8,17 @@ import numpy as np
 
 from benchmarks._residuals import Dense, Source, power_columns, tree
 from gridsec.arrays import Floats
+from gridsec.estimators.front.measurements import COMMON_SHARE, measurements, nominal_uncertainty
 from gridsec.estimators.modal import core, costs, doubts, full, masking, static
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.costs import SearchProblem
 from gridsec.estimators.modal.doubts import Unknown
 from gridsec.estimators.modal.model import modes
 from gridsec.estimators.modal.signatures import Joint
-from gridsec.estimators.sequential.measurements import COMMON_SHARE, measurements, nominal_uncertainty
 from gridsec.grid.network import Power
+from tests.gridsec.estimators.modal.streets import front_end
 from tests.gridsec.estimators.modal.test_core import MODEL
 from tests.gridsec.estimators.modal.test_filter import proportional
-from tests.gridsec.estimators.sequential.test_monitor import prepare
 from tests.gridsec.street import Street, make_plant
 
 STEPS = power_columns(tree(12, np.random.default_rng(3)))[:, :12]
@@ -67,7 +67,7 @@ def test_a_lasting_error_along_an_unknown_direction_is_no_evidence() -> None:
 def test_an_injection_that_follows_the_estimate_is_wider_by_its_own_factor() -> None:
     """Its own deviation in the estimate, `FOLLOWS` times that in the filter; far ones `WIDER` times."""
     plant = make_plant(np.random.default_rng(5), customers=12, drop=0.08)
-    front, street = prepare(plant), Street(plant, np.random.default_rng(6))
+    front, street = front_end(plant), Street(plant, np.random.default_rng(6))
     droop, one = plant.droop, np.ones(12, dtype=np.bool_)
     measured = measurements(front, street.frame(), one, one[:1], 1.0)
     usual = np.sqrt(3.0) * (front.injections[droop.customer] + front.mismatch)
@@ -90,7 +90,7 @@ def test_an_injection_that_follows_the_estimate_is_wider_by_its_own_factor() -> 
 def test_unread_powers_are_wrong_together() -> None:
     """Their errors have the common share of the front end; the sum of k is k times as uncertain as one."""
     plant = make_plant(np.random.default_rng(5), customers=12, drop=0.08)
-    front, street = prepare(plant), Street(plant, np.random.default_rng(6))
+    front, street = front_end(plant), Street(plant, np.random.default_rng(6))
     one, unread, usual = np.ones(12, dtype=np.bool_), np.arange(12) < 3, nominal_uncertainty(front)
     frame = street.frame()
     frame = replace(frame, p_error=np.where(unread, 0.2, frame.p_error))

@@ -10,14 +10,14 @@ import pytest
 
 from benchmarks._residuals import Dense, Source
 from gridsec.arrays import Floats
+from gridsec.estimators.front.state import InjectionError
 from gridsec.estimators.modal import core, doubts, drive
 from gridsec.estimators.modal.filter import Interval
 from gridsec.estimators.modal.monitor import ModalDesign, ModalState, design, init, step
 from gridsec.estimators.modal.verdict import Inputs, deviations
-from gridsec.estimators.sequential.state import InjectionError
 from gridsec.interface import Decision, Frame, Verdict
+from tests.gridsec.estimators.modal.streets import front_end
 from tests.gridsec.estimators.modal.test_core import MODEL
-from tests.gridsec.estimators.sequential.test_monitor import prepare
 from tests.gridsec.street import Street, make_plant
 
 ONSET, TICKS = 60, 110
@@ -28,7 +28,7 @@ LIE = 0.06
 def watched(lies: tuple[int, ...]) -> tuple[ModalDesign, list[tuple[ModalState, Verdict, Floats]]]:
     """Meters that read 3 % too high and too low by turns, with all states, verdicts and true injections."""
     plant = make_plant(np.random.default_rng(5), customers=12, drop=0.08)
-    front, street = prepare(plant), Street(plant, np.random.default_rng(6))
+    front, street = front_end(plant), Street(plant, np.random.default_rng(6))
     street.v0 = 0.95
     street.rest()
     made = design(plant, doubt=front.doubt, step_s=1.0)

@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 
 from gridsec.arrays import Floats
-from gridsec.estimators.sequential.design import SequentialDesign
-from gridsec.estimators.sequential.state import InjectionError
-from gridsec.estimators.sequential.step import injection_target, relaxed
-from tests.gridsec.estimators.sequential.test_monitor import prepare
+from gridsec.estimators.front.design import FrontDesign
+from gridsec.estimators.front.observer import injection_target, relaxed
+from gridsec.estimators.front.state import InjectionError
+from tests.gridsec.estimators.modal.streets import prepare
 from tests.gridsec.street import make_plant
 
 STEPS = 200
 """Short steps of an interval."""
 
 
-def made(seed: int) -> SequentialDesign:
-    return prepare(make_plant(np.random.default_rng(seed), customers=12, drop=0.08))
+def made(seed: int) -> FrontDesign:
+    return prepare(make_plant(np.random.default_rng(seed), customers=12, drop=0.08)).front
 
 
-def begun(design: SequentialDesign, y: Floats, width: Floats) -> InjectionError:
+def begun(design: FrontDesign, y: Floats, width: Floats) -> InjectionError:
     """Known injections, with the squared voltages at the inputs and their largest errors, (m,)."""
     return InjectionError(np.zeros(y.size), y, width, design.plant.droop.span)
 

@@ -14,7 +14,7 @@ from gridsec.estimators.modal.replay import Reading
 from gridsec.estimators.modal.search import Identification
 from gridsec.estimators.modal.verdict import combined
 from gridsec.interface import Decision, Explanation
-from tests.gridsec.estimators.sequential.test_monitor import prepare
+from tests.gridsec.estimators.modal.streets import front_end
 from tests.gridsec.street import Street, make_plant
 
 P = 5
@@ -83,7 +83,7 @@ def test_errors_of_registers_follow_the_voltage() -> None:
     plant = make_plant(
         np.random.default_rng(5), customers=12, drop=0.03, inverters=np.zeros(0, dtype=np.intp)
     )
-    front = prepare(plant)
+    front = front_end(plant)
     made = design(plant, doubt=front.doubt, step_s=1.0)
     street, largest = Street(plant, np.random.default_rng(6)), 0.0
     state = init(made, street.t)

@@ -1,0 +1,491 @@
+"""Measurements of one frame: plausibility, clock offsets, and the uncertainty of the powers.
+
+A meter with a clock that is o ahead reports at tick t its reading of t - o. Its residual is off by at most
+the change of its voltage meanwhile, by the model
+
+    c_j(t) = max over k = 1 .. K_j of |v2_j(t) - v2_j(t - k h)|,   K_j = ceil(|o_j| / h) + 1,
+
+h being the interval of the ticks. A reading at an offset beyond `largest_offset` counts as missing.
+
+A busbar reading with an offset o is left out while the busbar's squared voltage u changed within K ticks by
+more than the meter's accuracy class. u is the meter's own reading, which changes first where the clock is
+behind, or the median change of the trusted meters of the phase, which changes first where it is ahead.
+
+References
+----------
+docs/theory-front.md, sections 1 and 3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cache
+from math import ceil
+from operator import is_
+from typing import TypeVar
+
+import numpy as np
+
+from gridsec.arrays import Bools, Floats, all_of, any_of
+from gridsec.estimators.front.design import FrontDesign
+from gridsec.estimators.front.posterior import (
+    EXACT,
+    UNMETERED,
+    LoadDoubt,
+    Prior,
+    prior_variance,
+    voltage_prior,
+)
+from gridsec.estimators.plant import NO_VOLTAGE, Plant, busbar_errors, losses, usual
+from gridsec.interface import Frame, PowerOrigin
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurements:
+    """Plausible measurements of one frame. N customers, p meters, b busbar phases (1 if balanced)."""
+
+    frame: Frame  # with possible powers
+    available: Bools  # (p,) meters with a reading
+    y: Floats  # (p,) squared voltages, pu, 0 without a reading
+    q: Floats  # (N,) reactive injections of the loads; net ones where `uses_q`, pu
+    uses_q: Bools  # (N,) metered net reactive power is used
+    reports_q: Bools  # (N,) net reactive power is reported
+    v0_squared: Floats | float  # squared busbar voltage, the last trusted one if need be, pu
+    busbar_metered: Bools | bool  # busbar voltage is metered and trusted; (3,) in three phases
+    busbar_reading: Floats  # (b,) reading of the busbar's meter
+    busbar_available: Bools  # (b,) the busbar's meter has a plausible reading
+
+
+def plausible(design: FrontDesign, frame: Frame) -> Frame:
+    """Frame with physically possible powers; no readings at clock offsets beyond `largest_offset`."""
+    far = unusable_offsets(design, frame.clock_offset)
+    frame = frame if far is None else replace(frame, seen=frame.seen & ~far)
+    p, p_error = _plausible(frame.p, frame.p_error, design.max_p)
+    q, q_error = _plausible(frame.q, frame.q_error, design.max_q)
+    if p is frame.p and q is frame.q and p_error is frame.p_error and q_error is frame.q_error:
+        return frame
+    p_std, q_std = _unchanged(frame.p_std, p == frame.p), _unchanged(frame.q_std, q == frame.q)
+    return replace(frame, p=p, p_error=p_error, q=q, q_error=q_error, p_std=p_std, q_std=q_std)
+
+
+def _unchanged(std: Floats | None, same: Bools) -> Floats | None:
+    """Standard deviations of unchanged powers; NaN for replaced ones."""
+    return None if std is None else np.where(same, std, np.nan)
+
+
+def _plausible(power: Floats, error: Floats, most: Floats) -> tuple[Floats, Floats]:
+    # NaN is not within.
+    if all_of(np.maximum(np.abs(power), error) <= most) and all_of(error >= 0.0):
+        return power, error
+    good = np.abs(power) <= most
+    known = good & (error >= 0.0) & (error <= most)
+    return np.where(good, power, 0.0), np.where(known, error, most)
+
+
+def measurements(
+    design: FrontDesign, frame: Frame, trusted: Bools, busbar: Bools, v0_before: Floats | float
+) -> Measurements:
+    """Measurements of a frame from `plausible`.
+
+    trusted, busbar: (p,) trusted meters and (b,) trusted phases of the busbar's meter. v0_before: last
+    trusted squared busbar voltage, pu.
+    """
+    plant = design.plant
+    available, y = frame.seen & np.isfinite(frame.y), frame.y
+    if all_of(available):
+        available = _all_available(available.size)
+    else:
+        y = np.where(available, y, 0.0)
+    uses_q, q = np.zeros(frame.q.size, dtype=np.bool_), frame.q
+    reports_q = np.abs(frame.q_net) <= design.max_q
+    if any_of(reports_q):
+        # An error beyond every possible power makes the report worthless.
+        reports_q &= (frame.q_net_error >= 0.0) & (frame.q_net_error <= design.max_q)
+    if any_of(reports_q):
+        known = np.zeros(frame.q.size, dtype=np.bool_)
+        known[plant.meters] = available & trusted
+        least, most = plant.droop.saturated(frame.q.size)
+        rest, room = (
+            np.where(reports_q, frame.q_net, 0.0) - frame.q,
+            frame.q_error + np.where(reports_q, frame.q_net_error, 0.0),
+        )
+        uses_q = known & reports_q & (least - room <= rest) & (rest <= most + room)
+        q = np.where(uses_q, frame.q_net, frame.q)
+    return Measurements(
+        frame,
+        available,
+        np.minimum(np.maximum(y, 0.0), NO_VOLTAGE),
+        q,
+        uses_q,
+        reports_q,
+        *_busbar(design, frame, busbar, v0_before),
+    )
+
+
+@cache
+def _all_available(meters: int) -> Bools:
+    """The same array for all ticks with every reading: identity replaces comparison."""
+    out = np.ones(meters, dtype=np.bool_)
+    out.flags.writeable = False
+    return out
+
+
+def _busbar(
+    design: FrontDesign, frame: Frame, trusted: Bools, before: Floats | float
+) -> tuple[Floats | float, Bools | bool, Floats, Bools]:
+    """Last four fields of `Measurements`."""
+    low, high = design.options.v2_limits
+    if design.plant.feeder.busbar_phases == 1:
+        v0 = frame.v0_squared
+        there = bool(low <= v0 <= high)  # False for NaN
+        metered = there and bool(trusted[0])
+        return v0 if metered else before, metered, np.array([v0]), np.array([there])
+    # One voltage for all phases is a start value, not a reading of each.
+    given = np.broadcast_to(frame.v0_squared if frame.v0_phases is None else frame.v0_phases, 3)
+    within = (low <= given) & (given <= high)
+    says = within & (frame.v0_phases is not None)
+    v0_squared = np.where(within & trusted, given, before)
+    return v0_squared, says & trusted, given, says
+
+
+# --- Powers and their errors ---
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PowerErrors:
+    """Powers of one frame and their errors. N customers, p meters."""
+
+    frame: Frame  # with possible powers
+    q: Floats  # (N,) net reactive injections of the model, observed ones included, pu
+    uses_q: Bools  # (N,) metered net reactive power is used: observed injections do not matter
+    v0_squared: Floats | float  # squared busbar voltage, pu; (3,) in three phases
+    trusted: Bools  # (p,) trusted meters: powers of the other customers may be false
+    sizes: Floats  # (N,) standard deviation of each customer's false power, pu
+
+    def linear_error(self, plant: Plant, injected: Floats) -> Floats:
+        """Largest error of the linear model at each customer for a known busbar voltage, (N,).
+
+        injected: (N,) largest errors of the inverters' injections, pu; also in `loss_error` and `errors`.
+        """
+        return plant.feeder.reach(*self.errors(plant, injected))[plant.feeder.bus]
+
+    def loss_error(self, plant: Plant, injected: Floats) -> tuple[Floats, Floats]:
+        """Largest error of the loss correction at each customer, (N,), and the correction."""
+        p_error, q_error = self.errors(plant, injected)
+        v0 = self.v0_squared
+        correction, off = losses(plant, self.frame.p, self.q, v0, p_error=p_error, q_error=q_error)
+        return off, correction[plant.feeder.bus]
+
+    def errors(self, plant: Plant, injected: Floats) -> tuple[Floats, Floats]:
+        """Largest errors of the net powers, (N,) each."""
+        frame = self.frame
+        p_error, q_error = frame.p_error.copy(), np.where(self.uses_q, frame.q_net_error, frame.q_error)
+        suspects = plant.meters[~self.trusted]
+        p_error[suspects] += self.sizes[suspects]
+        q_error[suspects] += np.abs(frame.q[suspects]) + FALSE_Q * self.sizes[suspects]
+        return p_error, q_error + np.where(self.uses_q, 0.0, injected)
+
+
+FALSE_Q = 0.5
+"""Largest reactive power per active power of a false report."""
+
+
+# --- Clock offsets ---
+
+
+_TICK_PART = 0.25
+"""Largest clock offset of a usable reading where ticks are long, as a part of a tick."""
+
+
+def largest_offset(design: FrontDesign) -> float:
+    """Largest clock offset of a usable reading, s."""
+    return max(design.options.largest_offset_s, _TICK_PART * design.step_s)
+
+
+def unusable_offsets(design: FrontDesign, offset_s: Floats | None) -> Bools | None:
+    """Meters with clock offsets (p,), s, beyond `largest_offset`, (p,); None for none. NaN: unknown."""
+    if offset_s is None:
+        return None
+    far: Bools = np.asarray(np.abs(offset_s) > largest_offset(design))  # False for NaN
+    return far if any_of(far) else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClockSkew:
+    """Changes of the voltages within the clock offsets. p meters."""
+
+    model: Floats  # (k, p) squared voltages of the model at the last ticks, the newest last, pu
+    change: Floats  # (p,) c at the last tick, squared pu
+
+
+def update_skew(
+    design: FrontDesign, before: ClockSkew | None, offset_s: Floats | None, v2: Floats
+) -> ClockSkew | None:
+    """Changes with one more tick; None without a measured offset.
+
+    offset_s: (p,) lead of each clock, s, NaN if not measurable; offsets beyond `largest_offset` count as
+    none. v2: (p,) voltages of the model, squared pu.
+    """
+    size = np.zeros(v2.size) if offset_s is None else np.abs(np.nan_to_num(offset_s))
+    size = np.where(size <= largest_offset(design), size, 0.0)
+    if not any_of(size):
+        return None
+    ticks = np.where(size > 0.0, np.ceil(size / design.step_s) + 1.0, 0.0)
+    old = np.zeros((0, v2.size)) if before is None else before.model
+    change = np.zeros(v2.size)
+    for k in range(1, min(int(ticks.max()), len(old)) + 1):
+        change = np.where(ticks >= k, np.maximum(change, np.abs(v2 - old[-k])), change)
+    kept = ceil(largest_offset(design) / design.step_s) + 1
+    return ClockSkew(np.vstack([old, v2])[-kept:], change)
+
+
+# --- Busbar readings ---
+
+
+_LONGEST = 64
+"""Largest number of ticks over which changes are taken."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BusbarHistory:
+    """Readings of the last k ticks, the newest last, squared pu, NaN where missing. p meters, b phases."""
+
+    busbar: Floats  # (k, b) of the busbar's meter
+    y: Floats  # (k, p) of the meters
+
+
+def without_shifted_busbar(
+    design: FrontDesign,
+    history_before: BusbarHistory | None,
+    frame: Frame,
+    trusted: Bools,
+    v0_squared: Floats | float,
+) -> tuple[BusbarHistory | None, Frame]:
+    """Frame without busbar phases that changed within the clock offset, and history; None if not measured.
+
+    trusted: (p,) meters. v0_squared: last trusted squared busbar voltage, pu; (3,) in three phases.
+    """
+    offset = abs(frame.busbar_offset)
+    if not offset > 0.0:  # also for NaN
+        return None, frame
+    ticks = min(ceil(offset / design.step_s) + 1, _LONGEST)
+    reading = np.atleast_1d(np.asarray(frame.v0_squared if frame.v0_phases is None else frame.v0_phases))
+    y = np.where(frame.seen, frame.y, np.nan)
+    if history_before is None or history_before.busbar.shape[1] != reading.size:
+        history_before = BusbarHistory(np.zeros((0, reading.size)), np.zeros((0, y.size)))
+    allowed = np.atleast_1d(np.asarray(busbar_errors(design.plant, v0_squared, design.sigmas)))
+    here = (design.busbar_incidence > 0.0) & trusted[:, None]
+    moved: Bools = np.asarray(_beyond(reading - history_before.busbar[-ticks:], allowed).any(axis=0))
+    for phase in range(here.shape[1]):
+        change = (y - history_before.y[-ticks:])[:, here[:, phase]]
+        known = np.isfinite(change)
+        middle = [np.median(row[one]) for row, one in zip(change, known, strict=True) if any_of(one)]
+        if any_of(_beyond(np.array(middle), allowed[phase])):
+            moved = np.asarray(moved | _phase_mask(phase, reading.size))
+    history = BusbarHistory(
+        np.vstack([history_before.busbar, reading])[-_LONGEST:], np.vstack([history_before.y, y])[-_LONGEST:]
+    )
+    if not any_of(moved):
+        return history, frame
+    if frame.v0_phases is None:
+        return history, replace(frame, v0_squared=np.nan)
+    return history, replace(frame, v0_squared=np.nan, v0_phases=np.where(moved, np.nan, frame.v0_phases))
+
+
+def _phase_mask(phase: int, phases: int) -> Bools:
+    """Phase among those of the busbar's readings; all of them where one reading serves for all."""
+    return np.arange(phases) == phase if phases > 1 else np.ones(1, dtype=np.bool_)
+
+
+def _beyond(change: Floats, allowed: Floats) -> Bools:
+    """Changes beyond the accuracy class; a missing reading has none."""
+    return np.asarray(np.abs(np.nan_to_num(change, posinf=0.0, neginf=0.0)) > allowed)
+
+
+# --- Uncertainty of the frames ---
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameUncertainty:
+    """Uncertainty of one frame beyond that of the design. N customers, p meters, b busbar phases."""
+
+    p: Floats  # (N,) factors on the design's standard deviations: exact where withheld, else powers of 2
+    q: Floats  # (N,) likewise
+    busbar: Bools  # (b,) phases with a trusted busbar voltage
+    sizes: Floats  # (N,) standard deviations of false powers, pu: as large as the claims
+    vouched: Bools  # (p,) a usable active power of the meter's customer, or no reading of the meter
+    read: Bools  # (p,) as `vouched`, with late powers as readings
+    usual: bool = field(init=False)  # derived: all powers as in the design
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "usual", all_of(self.p <= 1.0) and all_of(self.q <= 1.0))
+
+
+def nominal_uncertainty(design: FrontDesign) -> FrameUncertainty:
+    """Uncertainty of the design."""
+    one, known = np.ones(design.customers), np.ones(design.busbar_incidence.shape[1], dtype=np.bool_)
+    vouched = np.ones(design.plant.meters.size, dtype=np.bool_)
+    sizes = np.full(design.customers, design.options.hidden_power)
+    return FrameUncertainty(one, one, known, sizes, vouched, vouched)
+
+
+_WIDER = 4.0
+"""Ratio of a frame's uncertainty to the design's beyond which it is used, unless a power is withheld."""
+
+
+_SAME_RATIO = 1.0 + 1e-9
+"""Ratio up to which two uncertainties differ by rounding only."""
+
+
+_LEAST_EFFECT = 0.5
+"""Part of the accuracy class by which late or excessive powers must be able to move a voltage to count."""
+
+
+COMMON_SHARE = 0.5
+"""Common share of the variance of unread powers."""
+
+
+def update_uncertainty(
+    design: FrontDesign, before: FrameUncertainty, frame: Frame, available: Bools, busbar: Bools | bool
+) -> FrameUncertainty:
+    """Uncertainty of this frame, with hysteresis of the factors and sizes.
+
+    available: (p,) meters with a reading. busbar: a trusted busbar voltage; (3,) in three phases.
+    """
+    # Intervals in units of the design's standard deviations.
+    frame, doubt = usual(frame), design.doubt
+    withheld, unread = _withheld(design, frame, available)
+    exact = None if unread is None else _customers(design, unread)
+    p, q = before.p, before.q
+    if not (before.usual and exact is None and _within(design, frame)):
+        p = _unless_same(_factor(frame.p_error, doubt.even_p, p, exact), p)
+        q = _unless_same(_factor(frame.q_error, doubt.even_q, q, exact), q)
+    every = _all_available(available.size)
+    after = (
+        p,
+        q,
+        _unless_same(np.atleast_1d(np.asarray(busbar)), before.busbar),
+        _claim_sizes(np.abs(frame.p), design.options.hidden_power, before.sizes),
+        _unless_same(every if withheld is None else ~withheld, before.vouched),
+        _unless_same(every if unread is None else ~unread, before.read),
+    )
+    old = (before.p, before.q, before.busbar, before.sizes, before.vouched, before.read)
+    return before if all(map(is_, after, old)) else FrameUncertainty(*after)
+
+
+_Array = TypeVar("_Array", Bools, Floats)
+
+
+def _unless_same(new: _Array, old: _Array) -> _Array:
+    """New value; the same array while it does not change: identity replaces comparison."""
+    return old if np.array_equal(new, old) else new
+
+
+def checked(design: FrontDesign, frame: Frame) -> Bools:
+    """Meters with an active power known about as well as the design supposes, (p,)."""
+    meters = design.plant.meters
+    if frame.p_origin is None:
+        return np.ones(meters.size, dtype=np.bool_)
+    origins = frame.p_origin[meters]
+    if not any_of(origins):
+        return np.ones(meters.size, dtype=np.bool_)
+    least = np.where(origins == PowerOrigin.UNREAD, _SAME_RATIO, _WIDER)
+    wide = frame.p_error[meters] > least * design.doubt.even_p[meters]
+    return np.asarray((origins == PowerOrigin.READ) | ~wide)
+
+
+def _withheld(design: FrontDesign, frame: Frame, available: Bools) -> tuple[Bools | None, Bools | None]:
+    """Meters with a voltage and no usable active power of its moment; those without a late one; (p,) or None.
+
+    A late power, or one beyond the declared range, counts if all of these together can move the voltage at
+    its meter by `_LEAST_EFFECT` of the accuracy class.
+    """
+    meters = design.plant.meters
+    if frame.p_origin is None or not any_of(frame.p_origin[meters]):
+        return None, None
+    origins, out = frame.p_origin[meters], available & ~checked(design, frame)
+    doubted = out & (origins != PowerOrigin.UNREAD)
+    if any_of(doubted):
+        power = np.where(_customers(design, doubted), frame.p_error, 0.0)
+        moved = design.plant.feeder.reach(power, np.zeros_like(power))[design.prior.meters]
+        out = out & ~(doubted & (moved <= _LEAST_EFFECT * design.allowed))
+    unread = out & (origins != PowerOrigin.LATE)
+    return out if any_of(out) else None, unread if any_of(unread) else None
+
+
+def _within(design: FrontDesign, frame: Frame) -> bool:
+    """All powers known about as well as the design supposes."""
+    doubt = design.doubt
+    return all_of(frame.p_error <= _WIDER * doubt.even_p) and all_of(frame.q_error <= _WIDER * doubt.even_q)
+
+
+def _customers(design: FrontDesign, meters: Bools) -> Bools:
+    """Customers of some meters, (N,)."""
+    out = np.zeros(design.customers, dtype=np.bool_)
+    out[design.plant.meters] = meters
+    return out
+
+
+def unread_powers(design: FrontDesign, uncertainty: FrameUncertainty) -> Bools:
+    """Customers with a power that nothing tells, (N,)."""
+    return np.asarray((uncertainty.p > 1.0) & _customers(design, ~uncertainty.read))
+
+
+def frame_prior(design: FrontDesign, uncertainty: FrameUncertainty) -> Prior:
+    """Prior of the voltages by the powers and the busbar of a frame; O(n p)."""
+    if uncertainty.usual and all_of(uncertainty.busbar):
+        return design.prior
+    doubt, busbar = _frame_doubt(design, uncertainty)
+    return voltage_prior(
+        design.plant.feeder, design.prior.meters, doubt, busbar=busbar, inverters=design.injections
+    )
+
+
+def frame_variance(design: FrontDesign, uncertainty: FrameUncertainty) -> Floats:
+    """Variances of `frame_prior`, (n,), squared pu^2, without the covariances."""
+    if uncertainty.usual and all_of(uncertainty.busbar):
+        return design.prior.variance
+    doubt, busbar = _frame_doubt(design, uncertainty)
+    return prior_variance(design.plant.feeder, doubt, busbar=busbar, inverters=design.injections)
+
+
+def _frame_doubt(design: FrontDesign, uncertainty: FrameUncertainty) -> tuple[LoadDoubt, Floats | float]:
+    """Uncertainty of the powers of a frame, and standard deviation of the busbar, squared pu; one or (3,)."""
+    p, q, doubt, together = uncertainty.p, uncertainty.q, design.doubt, design.doubt.together
+    if not all_of(uncertainty.read):
+        # Unread powers are low together by night, with a meter as without.
+        together = np.where(unread_powers(design, uncertainty), np.maximum(together, COMMON_SHARE), together)
+    busbar = np.where(uncertainty.busbar, design.busbar, UNMETERED)
+    wider = replace(
+        doubt,
+        together=together,
+        p=np.where(p > 1.0, np.maximum(doubt.p, EXACT) * p, doubt.p),
+        q=np.where(q > 1.0, np.maximum(doubt.q, EXACT) * q, doubt.q),
+    )
+    return wider, busbar if busbar.size > 1 else float(busbar[0])
+
+
+def _claim_sizes(power: Floats, least: float, before: Floats) -> Floats:
+    """Standard deviations of false powers: the claims in powers of two, with hysteresis."""
+    fine = (power <= before) & ((before <= least) | (4.0 * power >= before))
+    if all_of(fine):
+        return before
+    return np.where(fine, before, np.exp2(np.ceil(np.log2(np.maximum(power, least)))))
+
+
+def _factor(error: Floats, known: Floats, old: Floats, exact: Bools | None) -> Floats:
+    """Factor by which a frame knows a power less well than the design assumes, with hysteresis.
+
+    The ratio itself where `exact`, else a power of two.
+    """
+    if exact is None and all_of(old <= 1.0) and all_of(error <= _WIDER * known):
+        return old
+    ratio = error / known
+    keep = (ratio <= old * _WIDER) & (ratio * _WIDER >= old) & (old > _WIDER)
+    raised = np.exp2(np.ceil(np.log2(np.maximum(ratio, 1.0))))
+    new = np.where(keep, old, np.where(ratio > _WIDER, raised, 1.0))
+    if exact is None:
+        return new
+    # A forecast states its own standard deviation; rounding it up would widen more than is stated.
+    near = (ratio <= _SAME_RATIO * old) & (ratio * _WIDER >= old) & (old > 1.0)
+    return np.where(exact, np.where(near, old, np.where(ratio > _SAME_RATIO, ratio, 1.0)), new)

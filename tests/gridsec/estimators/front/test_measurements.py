@@ -1,0 +1,202 @@
+"""Clock offsets: changes of the voltages within them, and the answers of the estimator `modal`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.clock_offsets import TAP_PU, run
+from benchmarks.late_powers import site, watcher, world
+from feeders.model.site import Snapshot, to_frame
+from feeders.simulation.scenario import START
+from gridsec.estimators.front.measurements import (
+    frame_prior,
+    frame_variance,
+    largest_offset,
+    nominal_uncertainty,
+    unusable_offsets,
+    update_skew,
+    update_uncertainty,
+    without_shifted_busbar,
+)
+from gridsec.estimators.modal.monitor import init, step
+from gridsec.interface import Cause, Decision, PowerOrigin
+from tests.gridsec.estimators.modal.streets import front_end, prepare
+from tests.gridsec.street import Street, make_plant
+
+P = 8
+
+
+def test_changes_are_those_of_the_definition() -> None:
+    """Against all pairs of ticks, for random voltages."""
+    made = front_end(make_plant(np.random.default_rng(1), customers=P, drop=0.02))
+    rng, most = np.random.default_rng(2), 15.0
+    # The last but three is the largest usable offset; the next is beyond that.
+    offset = np.array([0.5, -0.9, 2.0, -3.0, most, most + 0.1, np.nan, 0.0])
+    used = np.where(np.abs(np.nan_to_num(offset)) <= most, np.abs(np.nan_to_num(offset)), 0.0)
+    v2, skew = 1.0 + 0.01 * rng.standard_normal((150, P)), None
+    for t, now in enumerate(v2):
+        skew = update_skew(made, skew, offset, now)
+        c = np.zeros(P)
+        for j in range(P):
+            ticks = int(np.ceil(used[j])) + 1 if used[j] else 0
+            c[j] = max((abs(now[j] - v2[t - k, j]) for k in range(1, min(ticks, t) + 1)), default=0.0)
+        assert skew is not None
+        np.testing.assert_allclose(skew.change, c, rtol=1e-12)
+    assert unusable_offsets(made, offset).tolist() == [k == 5 for k in range(P)]
+    assert largest_offset(made) == most
+    assert largest_offset(replace(made, step_s=900.0)) == 225.0
+
+
+@pytest.mark.parametrize("offset", [None, np.zeros(P), np.full(P, np.nan)])
+def test_without_a_measured_offset_nothing_is_kept(offset: np.ndarray | None) -> None:
+    made = front_end(make_plant(np.random.default_rng(1), customers=P, drop=0.02))
+    kept = update_skew(made, None, np.full(P, 1.0), np.ones(P))
+    assert kept is not None
+    assert update_skew(made, kept, offset, np.ones(P)) is None
+
+
+def test_all_clocks_off_and_a_still_feeder_is_clean_and_liars_are_named() -> None:
+    """Offsets of 15 s, the largest usable ones."""
+    plant = make_plant(np.random.default_rng(3), customers=P, drop=0.02)
+    made, street = prepare(plant), Street(plant, np.random.default_rng(4))
+    state, offset = init(made, street.t - 1.0), np.full(P, largest_offset(made.front))
+    said = []
+    for k in range(200):
+        frame = replace(street.frame(), t=street.t + k, clock_offset=offset)
+        if k >= 100:
+            frame = replace(frame, y=frame.y + 0.05 * (np.arange(P) == 2))
+        state, _, verdict = step(made, state, frame)
+        said.append(verdict)
+    assert all(one.decision is Decision.CLEAN for one in said[70:100])
+    assert said[-1].suspects.tolist() == [k == 2 for k in range(P)]
+    state, _, verdict = step(made, state, replace(street.frame(), t=street.t + 200.0))
+    assert state.front.clock_skew is None
+
+
+def test_a_meter_with_an_unusable_offset_is_neither_clean_nor_accused() -> None:
+    """The busbar wanders; one clock is 40 s ahead; another meter is manipulated, and one falls silent."""
+    plant = make_plant(np.random.default_rng(3), customers=P, drop=0.02)
+    made, street, rng = prepare(plant), Street(plant, np.random.default_rng(4)), np.random.default_rng(5)
+    state, offset, said = init(made, street.t - 1.0), np.where(np.arange(P) == 6, 40.0, np.nan), []
+    past = [street.frame()] * 40
+    wander = 0.0
+    for k in range(300):
+        wander += rng.normal(0.0, 2e-3) - 0.02 * wander
+        now = street.frame()
+        now = replace(now, t=street.t + k, v0_squared=now.v0_squared + wander, y=now.y + wander)
+        past.append(now)
+        y = np.where(np.arange(P) == 6, past[-41].y, now.y) + 0.05 * ((np.arange(P) == 2) & (k >= 150))
+        seen = now.seen & ~((np.arange(P) == 5) & (100 <= k < 120))
+        state, _, verdict = step(made, state, replace(now, y=y, seen=seen, clock_offset=offset))
+        said.append(verdict)
+    assert not np.any([one.suspects[6] or one.suspects[5] for one in said])
+    assert {one.cause for one in said[70:100]} == {Cause.CLOCK_OFFSET}
+    names = plant.feeder.customers[plant.meters[6]]
+    assert f"clock offset of {names} is above 15 s" in said[99].reason
+    assert said[110].cause is Cause.SILENT_METERS
+    assert "clock offset" in said[110].reason
+    assert all(one.decision is Decision.UNDECIDED for one in said[:150])
+    assert said[-1].suspects.tolist() == [k == 2 for k in range(P)]
+    assert np.isnan(said[-1].score[6])
+
+
+@pytest.mark.canary("4.0")
+@pytest.mark.parametrize("offset", [-2.0, 4.0])
+def test_tap_steps_accuse_no_busbar_with_a_measured_offset(offset: float) -> None:
+    """Right clocks of the meters. Without the offset the busbar's meter is named."""
+    where, made, truth = site(0.0), watcher(0.0), world(0, 480, TAP_PU)
+    count, before = truth.v.shape[1], len(truth.p_kw) - truth.t.size
+    for measured in (False, True):
+        state, named, attacked = made.init(START), 0, 0
+        for k, t in enumerate(truth.t):
+            v0 = truth.v0[int(np.clip(round(k - offset), 0, truth.t.size - 1))]
+            p = truth.register * truth.p_kw[k + before]
+            said = Snapshot(t, truth.read[k], p, np.full(count, np.nan), v0)
+            said = replace(said, busbar_offset_s=offset if measured else np.nan)
+            state, _, verdict = made.step(state, to_frame(where, said))
+            named += int(verdict.busbar.any())
+            attacked += verdict.decision is Decision.ATTACKED
+        assert (named == 0) is measured
+        assert (attacked == 0) is measured
+
+
+def test_a_reading_of_another_moment_is_left_out_within_the_offset_of_a_step() -> None:
+    """Both directions, a step of the meters and of the busbar's reading."""
+    plant, trusted = make_plant(np.random.default_rng(1), customers=P, drop=0.02), np.ones(P, dtype=np.bool_)
+    made, one = front_end(plant), Street(plant, np.random.default_rng(2)).frame()
+    for offset in (2.5, -2.5):
+        moment, left = None, []
+        for k in range(40):
+            y = np.full(P, 1.0 + 0.03 * (k >= 20))
+            v0 = 1.0 + 0.03 * (k >= 20 + offset)
+            frame = replace(one, y=y, seen=trusted, v0_squared=v0, busbar_offset=offset)
+            moment, out = without_shifted_busbar(made, moment, frame, trusted, 1.0)
+            left += [k] if np.isnan(out.v0_squared) else []
+        first, last = sorted((20, int(np.ceil(20 + offset))))
+        assert left == list(range(first, last + 4))
+    moment, out = without_shifted_busbar(made, moment, replace(one, busbar_offset=np.nan), trusted, 1.0)
+    assert moment is None
+    assert np.isfinite(out.v0_squared)
+
+
+def test_uncertainty_of_a_frame_is_that_of_its_tick() -> None:
+    """Factors by powers of two from four times the design's half-width on; back at the next usual frame."""
+    plant = make_plant(np.random.default_rng(3), customers=3, drop=0.02)
+    made, frame = front_end(plant), Street(plant, np.random.default_rng(4)).frame()
+    known, rng = np.sqrt(3.0) * np.maximum(made.doubt.p, 1e-6), np.random.default_rng(5)
+    now = nominal_uncertainty(made)
+    for _ in range(200):
+        ratio = np.exp2(rng.integers(0, 10, 3))
+        given = replace(frame, p_error=ratio * known)
+        now = update_uncertainty(made, now, given, frame.seen, busbar=True)
+        assert (4.0 * now.p >= ratio).all()
+        assert (now.p <= 4.0 * np.maximum(ratio, 1.0)).all()
+        assert (np.log2(now.p) % 1.0 == 0.0).all()
+        assert update_uncertainty(made, now, given, frame.seen, busbar=True) is now
+    now = update_uncertainty(made, now, replace(frame, p_error=known), frame.seen, busbar=True)
+    assert now.usual
+    assert frame_prior(made, now) is made.prior
+
+
+@pytest.mark.parametrize("busbar", [True, False])
+def test_prior_of_a_frame_by_the_matrices(*, busbar: bool) -> None:
+    """An unread power: half of its variance is common; a missing busbar voltage is unknown by 0.1."""
+    none = np.zeros(0, dtype=np.intp)
+    plant = make_plant(np.random.default_rng(3), customers=5, drop=0.02, inverters=none)
+    made, frame = front_end(plant), Street(plant, np.random.default_rng(4)).frame()
+    origin = np.where(np.arange(5) == 2, PowerOrigin.UNREAD, PowerOrigin.READ)
+    error = np.where(np.arange(5) == 2, 0.1, frame.p_error)
+    given = replace(frame, p_error=error, p_origin=origin)
+    now = update_uncertainty(made, nominal_uncertainty(made), given, frame.seen, busbar=busbar)
+    assert now.vouched.tolist() == [k != 2 for k in range(5)]
+    p, q = (
+        np.where(np.arange(5) == 2, wide / np.sqrt(3.0), usual)
+        for wide, usual in ((error, made.doubt.p), (frame.q_error, made.doubt.q))
+    )
+    g = np.sqrt(np.where(np.arange(5) == 2, 0.5, 0.0))
+    alone, model = np.sqrt(1.0 - g**2), plant.feeder.linear()
+    u = 2.0 * model.R_bus @ (g * p) + 2.0 * model.X_bus @ (g * q)
+    S = np.zeros((6, 6))
+    for matrix, s, c in ((model.R_bus, p, made.doubt.common_p), (model.X_bus, q, made.doubt.common_q)):
+        V = (1.0 - c) * np.diag((alone * s) ** 2) + c * np.outer(alone * s, alone * s)
+        S += 4.0 * matrix @ V @ matrix.T
+    S += np.outer(u, u) + (made.busbar if busbar else 0.1) ** 2
+    found = frame_prior(made, now)
+    np.testing.assert_allclose(found.covariance, S[:, made.prior.meters], rtol=1e-9)
+    np.testing.assert_allclose(found.variance, np.diag(S), rtol=1e-9)
+    np.testing.assert_allclose(frame_variance(made, now), np.diag(S), rtol=1e-9)
+
+
+@pytest.mark.acceptance
+@pytest.mark.xfail(reason="`modal` names two honest meters after tap steps within measured clock offsets")
+def test_tap_steps_accuse_no_meter_with_a_measured_offset() -> None:
+    """Clocks within 3 s, a tap step every two minutes: without the offsets honest meters are named."""
+    unknown, _ = run(0, 480, TAP_PU, measured=False)
+    measured, _ = run(0, 480, TAP_PU, measured=True)
+    assert unknown["honest"] > 0
+    assert measured["named"] == measured["liars"]
+    assert measured["honest"] == 0
+    assert measured["attacked"] == 0

@@ -1,0 +1,92 @@
+"""Honest meters stay unaccused: runs of `benchmarks.accusations` by situation and seed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks._scenes import CLOCK_S, LATE_S, USUAL, Model, Setting, received
+from benchmarks.accusations import Run, cell, cells, run
+from feeders.model.site import Snapshot
+from gridsec.interface import Decision
+
+RUNS = [
+    *(("majority", seed) for seed in (1, 2, 4, 14, 17, 18, 35, 47, 79, 128, 156, 185)),
+    *(("phases-busbar", seed) for seed in (0, 33, 35, 36)),
+    *(("phases-lateral", seed) for seed in (1, 18, 29, 77, 93)),
+    *(("drift", seed) for seed in (4, 38)),
+    *(("contiguous-low", seed) for seed in (0, 1, 2)),
+    *(("false-power", seed) for seed in (0, 1, 2)),
+]
+
+
+@pytest.mark.canary(
+    "majority-14",
+    "contiguous-low-0",
+    "false-power-1",
+)
+@pytest.mark.parametrize(("situation", "seed"), RUNS)
+def test_no_honest_meter_is_accused(situation: str, seed: int) -> None:
+    assert run(situation, seed).accused == ()
+
+
+def test_a_run_is_its_situation_and_seed() -> None:
+    def told(one: Run) -> tuple[object, ...]:
+        return one.cell, one.decisions, one.manipulated, one.named, one.accused, one.ratio, one.clean_volt
+
+    setting, size = cell("majority", 9)
+    one = run("majority", 9)
+    assert told(one) == told(run("majority", 9))
+    assert one.cell.startswith(setting.feeder)
+    assert one.cell.endswith(f"{size:g}")
+    assert len(one.manipulated) == 4
+    assert sum(one.decisions.values()) == 90
+
+
+@pytest.mark.parametrize("model", [Model.LATE, Model.CLOCKS])
+def test_readings_of_other_moments(model: Model) -> None:
+    """Oracle: readings that are their own tick. Late powers tell their age; clocks move both alike."""
+    count, first = 200, 80
+    ticks = [
+        Snapshot(float(k), np.full(9, float(k)), np.full(9, k + 0.5), np.full(9, k + 0.25), 230.0)
+        for k in range(count)
+    ]
+    one = list(received(Setting("cigre-lv", model, learned=False, seed=3), ticks))[first]
+    assert one.t == first
+    assert (one.q_kvar == one.p_kw - 0.25).all()
+    behind = one.t - one.p_kw + 0.5
+    if model is Model.LATE:
+        assert (behind == LATE_S).all()
+        assert (one.p_age_s == LATE_S).all()
+        assert (one.v_volt == first).all()
+    else:
+        assert (one.v_volt == one.p_kw - 0.5).all()
+        assert one.p_age_s is None
+        assert set(behind) <= set(range(-CLOCK_S, CLOCK_S + 1))
+        assert len(set(behind)) > 2
+
+
+def test_a_further_model_takes_the_place_of_all() -> None:
+    """The usual models are filters, and leave the runs as they are."""
+    assert {each[1] for each in cells("drift", model=Model.SILENT)} == {Model.SILENT}
+    assert cells("drift", model=Model.LOADS) == cells("drift")
+    assert {each[1] for each in cells("drift")} == set(USUAL)
+
+
+@pytest.mark.acceptance
+def test_manipulations_begin_by_clocks_that_are_off() -> None:
+    """39 of 118 meters begin one after another within six seconds: all are named, and no honest one."""
+    one = run("contiguous-low", 4, model=Model.CLOCKS)
+    assert not one.accused
+    assert len(one.named) == len(one.manipulated) == 39
+    assert not one.decisions[Decision.CLEAN]
+
+
+@pytest.mark.acceptance
+def test_meters_within_a_wide_deviation_stay_named() -> None:
+    """Four meters off by 0.5 % beside an unread power: named once, and never CLEAN."""
+    one = run("contiguous-low", 200)
+    assert not one.accused
+    assert one.settled < 5.0
+    assert one.decisions[Decision.ATTACKED] >= 85
+    assert not one.decisions[Decision.CLEAN]
