@@ -54,7 +54,7 @@ from tests.service.ticks import tick_of
 
 FEEDER = "simbench-lv-rural1"
 EVERY = 50  # One feeder in as many is attacked.
-TICKS = 12  # Ticks of a monitor before the measurement.
+TICKS = 20  # Ticks of a monitor before the measurement.
 REQUESTS = 15
 VIEWS, CHANGES = 3, 5  # Measurements in the browser.
 HEAD = {"order": "worst", "limit": "50"}  # Request of the web page.

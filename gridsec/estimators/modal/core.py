@@ -335,12 +335,10 @@ def step(  # noqa: PLR0917  # the state, and one tick
             suspected = replay.carried(made, state.detector.onsets, state.static, pinned)
         suspected = tuple(replay.follow(made, each, update.exact, update.gap) for each in suspected)
     others = tuple([rivals.follow(each, t, m, seen, unknown, jump) for each in state.rivals])
-    if evidence.log_m >= core.limit and (not pinned or _elsewhere(evidence, pinned)):
+    if evidence.log_m >= core.limit and (not pinned or _elsewhere(evidence, pinned, test, others)):
         test = detector.pin(test, evidence.rows)
         last = replay.record(state.history, (after, known, test, ()), m, seen, unknown, jump)
-        # An onset in place of a suspected one has to explain the misfit since that.
-        since = others[0].ticks if pinned and others else 0
-        others = rivals.replayed(made, core.rivals, last, test.onsets, int(evidence.rows[0]), since)
+        others = rivals.replayed(made, core.rivals, last, test.onsets, int(evidence.rows[0]))
         if update.exact is not None:
             rows = np.flatnonzero(test.pinned).tolist()
             suspected = replay.replayed(made, last, test.onsets, rows)
@@ -477,10 +475,11 @@ def doubted(found: Identification, meters: int) -> float:
     return out
 
 
-def _elsewhere(evidence: Evidence, pinned: list[int]) -> bool:
-    """Another onset is far likelier than the pinned ones."""
-    by_row = evidence.by_row.max(axis=0)
-    return bool(by_row.max() > by_row[pinned].max() + FARTHER)
+def _elsewhere(evidence: Evidence, pinned: list[int], test: Detector, others: tuple[Rival, ...]) -> bool:
+    """Another onset is far likelier than the pinned ones, and leaves no misfit before it open."""
+    by_row, row = evidence.by_row.max(axis=0), int(evidence.rows[0])
+    likelier = by_row[row] > by_row[pinned].max() + FARTHER
+    return bool(likelier) and not (others and others[0].precedes(int(test.onsets.age[row])))
 
 
 def alarmed(core: Core, evidence: Evidence) -> bool:
@@ -618,8 +617,8 @@ def _aligned(core: Core, found: Identification) -> bool:
 def transition(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
     """Add a rival with a transition, where the misfit is not settled and it is the likeliest.
 
-    The transition begins with the earliest suspected onset. It replaces an earlier one. The state is the same
-    where another model is likelier. Older onsets are tried at about every fifth part of their age.
+    It begins with the onset at which suspicion began. An earlier one is replaced. The state is unchanged where
+    another model is likelier. Older onsets are tried at about every fifth part of their age.
 
     Parameters
     ----------
@@ -628,8 +627,8 @@ def transition(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
     suspicion
         The explanations after the same tick.
     """
-    age = _since(state)
-    if suspicion.settled or not state.rivals or age % max(1, age // TRIALS):
+    age = state.rivals[0].ticks if state.rivals else 0
+    if suspicion.settled or not age or age % max(1, age // TRIALS):
         return state
 
     def cost_of(rival: Rival) -> float:
@@ -656,13 +655,13 @@ def passed(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreStat
     suspicion
         The explanations after the same tick.
     """
-    age, found, readings = _since(state), suspicion.found, state.history.readings
-    if not state.rivals or age > len(readings):
+    found, readings = suspicion.found, state.history.readings
+    if not state.rivals:
         return None
     model = int(found.model[0])
-    length = state.rivals[model].transition
+    length, age = state.rivals[model].transition, state.rivals[model].ticks
     without = found.weight[(found.model == model) & ~found.chosen.any(axis=1)].sum()
-    if not length or age - length < PASSED or without < DOUBT:
+    if not length or not length + PASSED <= age <= len(readings) or without < DOUBT:
         return None
     first, apart = len(readings) - age, rivals.APART * np.eye(core.modes.size)
 
@@ -698,11 +697,6 @@ def outlasts(core: Core, state: CoreState, suspicion: Suspicion) -> bool:
         return False
     again = identify(core, after, evidence, suspicion)
     return bool((again.found.named >= suspicion.found.named).all())
-
-
-def _since(state: CoreState) -> int:
-    """Kept readings since the earliest suspected onset."""
-    return state.rivals[0].ticks if state.rivals else 0
 
 
 def _keeping(found: Identification) -> Bools:

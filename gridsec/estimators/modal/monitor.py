@@ -373,13 +373,13 @@ def _named(
 ) -> tuple[ModalState, Evidence]:
     """State after a search with explanations, with the confirmed meters masked."""
     kernel, tick, masked = design.core, state.front.ticks, state.core.masked.meters
+    age = int(state.core.detector.onsets.age[suspicion.row])
     named = suspicion.found.named & ~masked
     streak = np.where(suspicion.found.chosen[0, : named.size], state.streak + 1, 0)
     certain = verdict.certain_phases(kernel, suspicion) & suspicion.fits
     phases = np.where(certain, state.phases + 1, 0)
     certain = verdict.certain_inverters(design.front, kernel, suspicion, uses_q) & suspicion.fits
     inverters = np.where(certain, state.inverters + 1, 0)
-    age = int(state.core.detector.onsets.age[suspicion.row])
     # A fault with a first naming is searched again at the next tick.
     first = any((each == 1).any() for each in (streak[named], phases, inverters))
     wait = 1 if first else max(1, age // LOOKS)

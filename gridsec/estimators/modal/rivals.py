@@ -88,8 +88,10 @@ class Rival:
     unsteady
         Share of the last ticks with a jump, 1: a mean with the memory of `RECENT` ticks.
     misfit, count, ticks
-        Squares of the whitened innovations since the earliest suspected onset, less their number; that
-        number, and the ticks since then. Those before the kept readings do not count.
+        Squares of the whitened innovations since the onset, less their number; that number, and their ticks.
+        Those before the kept readings do not count.
+    excess
+        The first two of each tick since the onset, at most of ``2 HALF`` ticks.
     update
         The filter's last step.
     loads
@@ -110,6 +112,7 @@ class Rival:
     misfit: float = 0.0
     count: int = 0
     ticks: int = 0
+    excess: tuple[tuple[float, int], ...] = ()
     update: Update | None = None
     loads: float = 1.0
     transition: int = 0
@@ -117,7 +120,12 @@ class Rival:
     @property
     def chance(self) -> float:
         """Misfit that needs no explanation."""
-        return BY_CHANCE * sqrt(2.0 * self.count)
+        return by_chance(self.count)
+
+    def precedes(self, age: int) -> bool:
+        """A misfit beyond chance precedes the last `age` ticks: no onset since then explains it."""
+        before = self.excess[: max(0, len(self.excess) - age)]
+        return sum(one for one, _ in before) > by_chance(sum(count for _, count in before))
 
     @property
     def unrest(self) -> float:
@@ -137,6 +145,11 @@ class Rival:
         if self.suspected is not None:
             return self.suspected.joint(self.modes)
         return signatures.joint(self.modes, self.onsets, self.static, 0)
+
+
+def by_chance(count: int) -> float:
+    """Misfit of `count` innovations that needs no explanation."""
+    return BY_CHANCE * sqrt(2.0 * count)
 
 
 def rivals(modes: Modes) -> tuple[Modes, ...]:
@@ -180,8 +193,8 @@ def first(modes: Modes, others: Sequence[Modes], history: History) -> list[Rival
     ]
 
 
-def replayed(  # noqa: PLR0917  # the readings, and two onsets
-    modes: Modes, others: Sequence[Modes], history: History, onsets: Onsets, row: int, since: int = 0
+def replayed(
+    modes: Modes, others: Sequence[Modes], history: History, onsets: Onsets, row: int
 ) -> tuple[Rival, ...]:
     """The model itself, without jumps, and all rivals, after the last reading.
 
@@ -193,8 +206,6 @@ def replayed(  # noqa: PLR0917  # the readings, and two onsets
         The readings.
     onsets, row
         The onsets of the detector after the last reading, and the row of the onset.
-    since
-        Age of an earlier suspected onset, ticks: a misfit that precedes the onset is not explained by it.
     """
     state, _, test, suspected = history.start
     count, age, had = len(history.readings), int(onsets.age[row]), detector.followed(modes, test).onsets
@@ -206,10 +217,7 @@ def replayed(  # noqa: PLR0917  # the readings, and two onsets
         begin, one = -1, signatures.single(had, row)
     out = [replace(each, onsets=one, suspected=exactly) for each in first(modes, others, history)]
     for k, (t, m, seen, unknown, jump) in enumerate(history.readings):
-        out = [
-            follow(each, t, m, seen, unknown, jump, begun=k == begin, counted=k == count - max(age, since))
-            for each in out
-        ]
+        out = [follow(each, t, m, seen, unknown, jump, begun=k == begin) for each in out]
     return tuple(out)
 
 
@@ -237,7 +245,7 @@ def transitions(modes: Modes, history: History, age: int, *, ramp: bool = False)
             within = follow(within, t, m, seen, unknown, jump)
         elif k < age - 1:
             wide = apart if unknown is None else np.hstack([unknown, apart])
-            within = follow(within, t, m, seen, wide, jump, begun=k == 0, counted=k == 0)
+            within = follow(within, t, m, seen, wide, jump, begun=k == 0)
             if (k + 1) & k == 0:
                 out.append(replace(within, transition=k + 1, misfit=0.0, count=0))
     return tuple(out)
@@ -252,7 +260,6 @@ def follow(  # noqa: PLR0917  # the state, and one tick
     jump: float = 0.0,
     *,
     begun: bool = False,
-    counted: bool = False,
 ) -> Rival:
     """Take in the residuals of one tick.
 
@@ -268,8 +275,8 @@ def follow(  # noqa: PLR0917  # the state, and one tick
         Unknown directions, as in `gridsec.estimators.modal.full.step`.
     jump
         As in `gridsec.estimators.modal.filter.Interval`.
-    begun, counted
-        The onset is at this tick, and the misfit begins with it.
+    begun
+        The onset is at this tick.
     """
     modes, state, known, gap = before.modes, before.filter, before.static, Interval(t - before.filter.t, jump)
     total, onsets, suspected, jumps = before.sum, before.onsets, before.suspected, before.jumps
@@ -308,9 +315,10 @@ def follow(  # noqa: PLR0917  # the state, and one tick
         suspected=suspected,
         jumps=jumps,
         unsteady=before.unsteady + (float(size > 0.0) - before.unsteady) / RECENT,
-        misfit=known.square - count + (0.0 if counted else before.misfit),
-        count=count + (0 if counted else before.count),
-        ticks=1 + (0 if counted else before.ticks),
+        misfit=known.square - count + (0.0 if begun else before.misfit),
+        count=count + (0 if begun else before.count),
+        ticks=1 + (0 if begun else before.ticks),
+        excess=(*(() if begun else before.excess[1 - 2 * replay.HALF :]), (known.square - count, count)),
         update=update,
         loads=loads,
     )

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks._residuals import Dense, Source, power_columns, tree
 from gridsec.arrays import Floats
-from gridsec.estimators.modal import core, detector, full, rivals, signatures
+from gridsec.estimators.modal import core, full, rivals, signatures
 from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.rivals import RATE, UNREST
 from tests.gridsec.estimators.modal.test_core import LIAR, MODEL
@@ -231,25 +231,20 @@ def test_a_manipulation_that_lasts_does_not_pass() -> None:
     assert any(each.transition for each in state.rivals)
 
 
-def test_an_onset_after_a_misfit_has_to_explain_it() -> None:
-    """Squares of the innovations count since the earlier onset, of which 4 ticks are off at all meters."""
-    kernel, state = core.assemble(MODEL, STEPS_OF_PLACES, np.full(12, 0.1), gamma=1e6), None
-    source = Source(MODEL, np.random.default_rng(2))
-    state = core.init(kernel, 0.0)
+def test_no_onset_after_a_misfit_explains_it() -> None:
+    """Readings of tick 20 to 23 are off at all meters, and the onset is that of tick 20."""
+    kernel, source = (
+        core.assemble(MODEL, STEPS_OF_PLACES, np.full(12, 0.1), gamma=1e6),
+        Source(MODEL, np.random.default_rng(2)),
+    )
+    (one,) = rivals.first(kernel.modes, (), core.init(kernel, 0.0).history)
     for k in range(60):
         off = 0.02 * np.random.default_rng(k).normal(size=12) * (20 <= k < 24)
-        state, _ = core.step(kernel, state, float(k), source.tick() + off)
-    onsets = detector.followed(kernel.modes, state.detector).onsets
-    row = int(np.flatnonzero(onsets.used & ~onsets.ramp & (onsets.age < 30) & (onsets.age > 5))[0])
-    own, longer = (
-        rivals.replayed(kernel.modes, kernel.rivals, state.history, onsets, row, since)[0]
-        for since in (0, 40)
-    )
-    assert (own.ticks, longer.ticks) == (int(onsets.age[row]), 40)
-    assert own.misfit < 2.0 * own.chance
-    assert longer.misfit > 10.0 * longer.chance
-    assert np.allclose(own.joint().score, longer.joint().score)
-    assert own.evidence == longer.evidence
+        one = rivals.follow(one, float(k), source.tick() + off, None, begun=k == 20)
+    assert len(one.excess) == one.ticks == 40
+    assert sum(each for each, _ in one.excess) == pytest.approx(one.misfit)
+    assert sum(count for _, count in one.excess) == one.count
+    assert [age for age in range(1, 50) if one.precedes(age)] == list(range(1, 40))
 
 
 STEPS_OF_PLACES = np.vstack([np.zeros((1, 12)), STEPS])
