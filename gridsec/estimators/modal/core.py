@@ -617,7 +617,7 @@ def _aligned(core: Core, found: Identification) -> bool:
 def transition(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
     """Add a rival with a transition, where the misfit is not settled and it is the likeliest.
 
-    It begins with the onset at which suspicion began. An earlier one is replaced. The state is unchanged where
+    It begins with the onset at which suspicion began. An earlier one is replaced. The state is the same where
     another model is likelier. Older onsets are tried at about every fifth part of their age.
 
     Parameters
