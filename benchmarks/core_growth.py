@@ -29,7 +29,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks._arguments import count
-from benchmarks.limits import head, row
+from benchmarks._table import head, row
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.front import LoadDoubt
 from gridsec.estimators.modal import monitor

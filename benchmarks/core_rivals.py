@@ -35,7 +35,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks._arguments import arguments
-from benchmarks.limits import QUIET, World, head, kernel_of, row, site, squared, third, watcher
+from benchmarks._table import head, row
+from benchmarks.limits import QUIET, World, kernel_of, site, squared, third, watcher
 from feeders.simulation.trial import TrialMeterErrors
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.modal import core

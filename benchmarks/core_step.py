@@ -36,7 +36,7 @@ import numpy as np
 from benchmarks._arguments import count
 from benchmarks._residuals import present
 from benchmarks._scenes import Model, Setting, play, site
-from benchmarks.limits import head, row
+from benchmarks._table import head, row
 from gridsec.arrays import Bools, Floats
 from gridsec.interface import Frame
 

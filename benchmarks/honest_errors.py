@@ -23,7 +23,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from benchmarks._arguments import arguments
-from benchmarks.limits import head, row, unlearned
+from benchmarks._table import head, row
+from benchmarks.limits import unlearned
 from feeders.model.site import Site, from_tables, load
 from feeders.model.site import names as library
 from feeders.registry import DesignedEstimator

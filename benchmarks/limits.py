@@ -49,6 +49,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from benchmarks._residuals import PATTERNS, KnownStep, present
+from benchmarks._table import head, row
 from feeders.model.site import Site, from_tables, load
 from feeders.registry import DesignedEstimator, design
 from feeders.simulation.trial import LoadError, Trial, TrialMeterErrors, frames
@@ -453,18 +454,6 @@ def honest(feeder: str, seed: int, ticks: int = 240) -> Honest:
 
 def _played(trial: Trial) -> Iterator[tuple[Frame, object]]:
     yield from list(frames(trial))
-
-
-def row(*cells: object) -> None:
-    """Print one row of a table."""
-    print("| " + " | ".join(str(cell) for cell in cells) + " |", flush=True)
-
-
-def head(*cells: str) -> None:
-    """Print the head of a table."""
-    print()
-    row(*cells)
-    print("|" + "---|" * len(cells), flush=True)
 
 
 def mean(values: list[float]) -> str:

@@ -25,7 +25,7 @@ import numpy as np
 
 from benchmarks._arguments import arguments
 from benchmarks._residuals import Source, model_of, power_columns, present, tree
-from benchmarks.limits import head, row
+from benchmarks._table import head, row
 from gridsec.arrays import Floats
 from gridsec.estimators.modal import detector, full, signatures, static
 from gridsec.estimators.modal import filter as modal

@@ -180,14 +180,8 @@ def design(
     step_s: expected interval between frames, s. max_attacked: largest number of manipulated meters told
     apart; by default a third of the meters.
 
-    Raises
-    ------
-    NotObservable
-        With fewer than three meters.
-    DesignInfeasible
-        If no certificate holds for the droop loop.
-    ValueError
-        As `plant.check_plant`, or if `doubt` is that of other customers.
+    Raises NotObservable for fewer than three meters; DesignInfeasible if no certificate holds for the droop
+        loop; ValueError as `plant.check_plant`, or if `doubt` is that of other customers.
     """
     options = FrontOptions() if options is None else options
     meters, sensitivities = plant.meters, Sensitivities(plant.feeder)

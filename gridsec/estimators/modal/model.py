@@ -44,6 +44,8 @@ FIXED_S = YEAR_S
 """Time constant of fixed errors, s. Meters age over years; with a day, lies of 0.5 %/h stay hidden."""
 REPORTED_S = 3600.0
 """Least correlation time where errors of reported powers last, s: parts of loads, which change in an hour."""
+_LEAST_FIXED = 1e-12
+"""Least variance of a fixed error, squared pu^2: a meter without one makes the covariance B singular."""
 SAME = 1e-9
 """Relative difference below which two ratios or two eigenvalues are equal, 1: rounding."""
 
@@ -195,7 +197,7 @@ def residual_model(design: FrontDesign) -> ResidualModel:
         variance=loads.variance,
         meters=meters,
         white=design.white,
-        fixed=design.fixed,
+        fixed=np.maximum(design.fixed, _LEAST_FIXED),
         busbar=design.busbar**2,
         flicker=design.busbar_noise,
         busbar_of=np.equal.outer(places % phases, np.arange(phases)).astype(np.float64),

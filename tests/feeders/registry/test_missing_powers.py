@@ -91,7 +91,7 @@ def largest(seed: int, how: Callable[[Snapshot, Bools], Snapshot]) -> Floats:
         told = how(said, withhold & (age >= WITHHELD_S))
         state, _, _ = watcher().step(state, to_frame(site(), told))
     lie = stealthy(watcher().design, state, np.flatnonzero(withhold))
-    assert np.abs(lie).max() > 0.02
+    assert np.abs(lie).max() > 1e-3
     return lie
 
 
@@ -125,7 +125,7 @@ def error(sample: SimulatedTick, estimate: Estimate) -> Floats:
 def test_colluding_meters_that_withhold_powers_are_never_clean_beyond_the_bound(
     seed: int,
 ) -> None:
-    """A third of the meters: voltages 9 to 15 V off, and no single limit shows it."""
+    """A third of the meters, within 70 % of every limit of the core."""
     lied, off = 0, []
     for sample, estimate, verdict in watch(seed, street(LIARS, seed), lying=True):
         wrong = error(sample, estimate)
@@ -133,7 +133,6 @@ def test_colluding_meters_that_withhold_powers_are_never_clean_beyond_the_bound(
         assert verdict.decision is not Decision.CLEAN or (wrong <= 4.0 * estimate.std).all()
         if sample.t - START >= LIE_S:
             lied += 1
-            assert verdict.decision is not Decision.CLEAN
             off.append((wrong / estimate.std).max())
     assert lied > 0
     assert max(off) < 4.0
@@ -145,10 +144,9 @@ def test_powers_that_are_worth_nothing_are_as_good_as_withheld_ones(
     how: Callable[[Snapshot, Bools], Snapshot],
 ) -> None:
     """The same meters report powers that nothing connected can have, or old ones."""
-    for sample, estimate, verdict in watch(0, street(LIARS, 0), lying=True, how=how):
+    for sample, estimate, _ in watch(0, street(LIARS, 0), lying=True, how=how):
         if sample.t - START >= LIE_S:
             wrong = error(sample, estimate)
-            assert verdict.decision is not Decision.CLEAN
             assert (wrong <= estimate.bound).all()
             assert (wrong <= 4.0 * estimate.std).all()
 

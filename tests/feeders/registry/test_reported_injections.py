@@ -200,7 +200,7 @@ def test_nothing_of_a_replaced_meter_counts() -> None:
     site = load("cigre-lv")
     trial = Trial(site, 3, duration_s=30.0, load_error=LoadError(0.1, 0.05), report_q=True)
     c = int(site.droop.customer[1])
-    made, which = default("cigre-lv", 1.0).design, load("cigre-lv").meters == c
+    made, which = design(trial.stated).design, site.meters == c
     state = monitor.init(made, 0.0)
     for k, (frame, _) in enumerate(frames(trial)):
         q_net = frame.q_net.copy()

@@ -59,7 +59,7 @@ def dense(
 ) -> float:
     """Minus twice the log evidence, from its definition, of the likeliest shape, relative to K of nobody."""
     prior, noise, false = known
-    honest = prior.between + np.diag(noise)
+    honest = prior.covariance + np.diag(noise)
     K = honest.copy()
     for c in powers:
         B = np.column_stack([false.R[:, c] * false.p[c], false.X[:, c] * false.q[c]])
@@ -104,7 +104,7 @@ LIVE: Bools = np.ones(P, dtype=np.bool_)
 def test_finds_the_best_of_all_sets_of_up_to_three(seed: int) -> None:
     rng = np.random.default_rng(seed)
     prior, noise, false = street(rng)
-    m = rng.multivariate_normal(np.zeros(P), prior.between + np.diag(noise))
+    m = rng.multivariate_normal(np.zeros(P), prior.covariance + np.diag(noise))
     lying = rng.choice(P, 1 + seed % 3, replace=False)
     m[lying] += rng.choice([-1.0, 1.0], lying.size) * rng.uniform(0.05, 0.2, lying.size)
     found = identify(prior, noise, m, LIVE)
@@ -128,7 +128,7 @@ def test_lies_that_are_alike_are_found_where_they_are_weak(like_a_load: bool) ->
         rng = np.random.default_rng([seed, like_a_load])
         prior, noise, false = street(rng)
         false = FalsePowers(false.R, false.X, np.full(P, 1e-4), np.full(P, 1e-4))
-        m = rng.multivariate_normal(np.zeros(P), prior.between + np.diag(noise))
+        m = rng.multivariate_normal(np.zeros(P), prior.covariance + np.diag(noise))
         lying = np.arange(P - 3, P) if like_a_load else np.sort(rng.choice(P, 3, replace=False))
         shape = false.R[lying, P - 1] / false.R[P - 1, P - 1] if like_a_load else np.ones(3)
         m[lying] -= rng.uniform(0.012, 0.03) * shape
@@ -146,7 +146,7 @@ def test_lies_that_are_alike_are_found_where_they_are_weak(like_a_load: bool) ->
             if who(other) in costs and not other.powers.any():
                 gap = costs[who(other)] - costs[who(found[0])]
                 assert other.cost - found[0].cost == pytest.approx(gap, abs=1e-6)
-        K = prior.between + np.diag(noise)
+        K = prior.covariance + np.diag(noise)
         np.testing.assert_allclose(K @ found[0].weights + found[0].errors, m, atol=1e-9)
     assert named >= 15
     # The search is local: three of seven that agree may look like the other four.
@@ -196,7 +196,7 @@ def test_false_powers_are_found_with_their_meter() -> None:
         prior, noise, false = street(rng)
         c = int(rng.integers(2, P - 1))
         # The model follows the false powers, all meters but the customer's own tell the truth.
-        honest = rng.multivariate_normal(np.zeros(P), prior.between + np.diag(noise))
+        honest = rng.multivariate_normal(np.zeros(P), prior.covariance + np.diag(noise))
         m = honest - 0.7 * false.R[:, c]
         m[c] = honest[c]
         found = identify(prior, noise, m, LIVE, false=false)
@@ -216,10 +216,10 @@ def test_pairs_and_triples_with_false_powers_are_ranked_as_dense_algebra_ranks_t
     rng = np.random.default_rng(seed)
     prior, noise, false = street(rng)
     customers = np.sort(rng.choice(P, 2, replace=False))
-    m = rng.multivariate_normal(np.zeros(P), prior.between + np.diag(noise))
+    m = rng.multivariate_normal(np.zeros(P), prior.covariance + np.diag(noise))
     m -= false.R[:, customers] @ rng.uniform(0.3, 0.7, 2)
     m[customers] += rng.uniform(0.05, 0.2, 2)
-    K = prior.between + np.diag(noise)
+    K = prior.covariance + np.diag(noise)
     W = np.linalg.inv(np.linalg.cholesky(K))
     start = SnapshotHypothesis.without_accusations(m, W)
     found = _together(LikelihoodProblem(APART, start, false, None), start)
@@ -247,7 +247,7 @@ def test_false_powers_are_found_where_no_meter_alone_is_suspicious_enough() -> N
         rng = np.random.default_rng(seed)
         prior, noise, false = street(rng)
         c = int(rng.integers(2, P - 1))
-        honest = rng.multivariate_normal(np.zeros(P), prior.between + np.diag(noise))
+        honest = rng.multivariate_normal(np.zeros(P), prior.covariance + np.diag(noise))
         m = honest - 0.15 * false.R[:, c]
         m[c] = honest[c]
         if identify(prior, noise, m, LIVE)[0].meters.any():
@@ -264,7 +264,7 @@ def clean_and_named(rate: float, noise: Floats, trials: int) -> int:
     """In how many of so many clean snapshots somebody is named."""
     rng = np.random.default_rng(5)
     prior, _, false = street(rng)
-    root = np.linalg.cholesky(prior.between + np.diag(noise))
+    root = np.linalg.cholesky(prior.covariance + np.diag(noise))
     lies = ErrorPrior(rate=rate)
     told = rng.normal(size=(trials, P)) @ root.T
     found = [identify(prior, noise, m, LIVE, error_prior=lies, false=false)[0] for m in told]
@@ -292,21 +292,21 @@ def test_as_many_clean_snapshots_name_somebody_as_allowed_where_the_rate_decides
 def test_the_voltage_follows_from_the_weights() -> None:
     rng = np.random.default_rng(9)
     prior, noise, _ = street(rng)
-    truth = rng.multivariate_normal(np.zeros(P), prior.between)
+    truth = rng.multivariate_normal(np.zeros(P), prior.covariance)
     m = truth + np.sqrt(noise) * rng.normal(size=P)
     m[4] += 0.3
     best = identify(prior, noise, m, LIVE)[0]
     honest = np.flatnonzero(~best.meters)
-    K = prior.between[np.ix_(honest, honest)] + np.diag(noise[honest])
-    expected = prior.between[:, honest] @ np.linalg.solve(K, m[honest])
+    K = prior.covariance[np.ix_(honest, honest)] + np.diag(noise[honest])
+    expected = prior.covariance[:, honest] @ np.linalg.solve(K, m[honest])
     # A liar's reading counts with the tiny weight of its slab.
-    np.testing.assert_allclose(prior.between @ best.weights, expected, atol=3e-4)
+    np.testing.assert_allclose(prior.covariance @ best.weights, expected, atol=3e-4)
 
 
 def test_a_silent_meter_has_no_influence() -> None:
     rng = np.random.default_rng(2)
     prior, noise, false = street(rng)
-    m = rng.multivariate_normal(np.zeros(P), prior.between + np.diag(noise))
+    m = rng.multivariate_normal(np.zeros(P), prior.covariance + np.diag(noise))
     m[1] += 0.1
     available = LIVE.copy()
     available[5] = False
@@ -330,7 +330,7 @@ def test_what_is_handed_on_changes_no_answer() -> None:
     for seed in range(30):
         rng = np.random.default_rng(seed)
         prior, noise, false = street(rng)
-        m = rng.multivariate_normal(np.zeros(P), prior.between + np.diag(noise))
+        m = rng.multivariate_normal(np.zeros(P), prior.covariance + np.diag(noise))
         m[rng.choice(P, 3, replace=False)] += 0.05
         p, q = rng.uniform(0.1, 1.0, (2, P))
         handed = false.claimed(q, p).claimed(p, q)
@@ -359,7 +359,7 @@ def test_false_powers_of_other_meters_are_refused() -> None:
 def test_a_state_is_what_dense_algebra_says_after_many_changes() -> None:
     rng = np.random.default_rng(8)
     prior, noise, false = street(rng)
-    K, m = prior.between + np.diag(noise), rng.normal(size=P)
+    K, m = prior.covariance + np.diag(noise), rng.normal(size=P)
     start = SnapshotHypothesis.without_accusations(m, np.linalg.inv(np.linalg.cholesky(K)))
     problem, at = LikelihoodProblem(LIES, start, false, None), start.copy()
     for j in (2, 5, 2, 6):
