@@ -85,6 +85,8 @@ ADOPTED = 0.05
 """Largest weight of sets that need a meter where loads are adopted, 1: a meter may hide its own load."""
 PASSED = 16
 """Ticks after a transition from which on its readings may be given up, 1."""
+WAITS = 2 * PASSED
+"""Ticks of a suspicion in which the misfit before another onset speaks against that, 1."""
 TRIALS = 4
 """Trials of a transition while the age of an onset doubles, about, 1: the replay takes a second or so."""
 RECALLED = 24
@@ -159,6 +161,8 @@ class CoreState:
         Meters with an own error beyond their accuracy class when they were compared last.
     loads
         Variance of the loads' errors, in that of the model, 1: more after a jump.
+    spell
+        Ticks in turn with a pinned onset.
     """
 
     filter: FilterState
@@ -171,6 +175,7 @@ class CoreState:
     rivals: tuple[Rival, ...] = ()
     beyond: Bools | None = None
     loads: float = 1.0
+    spell: int = 0
 
     @property
     def exceeding(self) -> Bools:
@@ -335,7 +340,7 @@ def step(  # noqa: PLR0917  # the state, and one tick
             suspected = replay.carried(made, state.detector.onsets, state.static, pinned)
         suspected = tuple(replay.follow(made, each, update.exact, update.gap) for each in suspected)
     others = tuple([rivals.follow(each, t, m, seen, unknown, jump) for each in state.rivals])
-    if evidence.log_m >= core.limit and (not pinned or _elsewhere(evidence, pinned, test, others)):
+    if evidence.log_m >= core.limit and (not pinned or _elsewhere(state, evidence, test, others)):
         test = detector.pin(test, evidence.rows)
         last = replay.record(state.history, (after, known, test, ()), m, seen, unknown, jump)
         others = rivals.replayed(made, core.rivals, last, test.onsets, int(evidence.rows[0]))
@@ -346,7 +351,9 @@ def step(  # noqa: PLR0917  # the state, and one tick
         test, suspected, others = detector.pin(test, evidence.rows[:0]), (), ()
     history = replay.record(state.history, (after, known, test, suspected), m, seen, unknown, jump)
     loads = update.gap.varied(made, state.loads)
-    return CoreState(after, known, test, update, history, suspected, masked, others, beyond, loads), evidence
+    spell = state.spell + 1 if pinned else 0
+    now = CoreState(after, known, test, update, history, suspected, masked, others, beyond, loads, spell)
+    return now, evidence
 
 
 def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState, Evidence]:
@@ -475,11 +482,16 @@ def doubted(found: Identification, meters: int) -> float:
     return out
 
 
-def _elsewhere(evidence: Evidence, pinned: list[int], test: Detector, others: tuple[Rival, ...]) -> bool:
-    """Another onset is far likelier than the pinned ones, and leaves no misfit before it open."""
+def _elsewhere(state: CoreState, evidence: Evidence, test: Detector, others: tuple[Rival, ...]) -> bool:
+    """Another onset is far likelier than the pinned ones, by more than the misfit that it leaves before it.
+
+    That misfit counts for `WAITS` ticks, in which a short manipulation passes. Later it would hide others.
+    """
     by_row, row = evidence.by_row.max(axis=0), int(evidence.rows[0])
-    likelier = by_row[row] > by_row[pinned].max() + FARTHER
-    return bool(likelier) and not (others and others[0].precedes(int(test.onsets.age[row])))
+    more = float(by_row[row] - by_row[state.detector.pinned].max())
+    if not others or state.spell > WAITS:
+        return more > FARTHER
+    return more > max(FARTHER, 0.5 * others[0].before(int(test.onsets.age[row])))
 
 
 def alarmed(core: Core, evidence: Evidence) -> bool:

@@ -122,10 +122,10 @@ class Rival:
         """Misfit that needs no explanation."""
         return by_chance(self.count)
 
-    def precedes(self, age: int) -> bool:
-        """A misfit beyond chance precedes the last `age` ticks: no onset since then explains it."""
-        before = self.excess[: max(0, len(self.excess) - age)]
-        return sum(one for one, _ in before) > by_chance(sum(count for _, count in before))
+    def before(self, age: int) -> float:
+        """Misfit beyond chance that precedes the last `age` ticks: no onset since then explains it."""
+        earlier = self.excess[: max(0, len(self.excess) - age)]
+        return sum(one for one, _ in earlier) - by_chance(sum(count for _, count in earlier))
 
     @property
     def unrest(self) -> float:

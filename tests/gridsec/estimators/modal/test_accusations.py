@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from benchmarks._scenes import CLOCK_S, LATE_S, USUAL, Model, Setting, received
+from benchmarks._scenes import CLOCK_S, LATE_S, USUAL, Model, Setting, begin, play, received, site
 from benchmarks.accusations import Run, cell, cells, run
 from feeders.model.site import Snapshot
 from gridsec.interface import Decision
@@ -90,3 +92,27 @@ def test_meters_within_a_wide_deviation_stay_named() -> None:
     assert one.settled < 5.0
     assert one.decisions[Decision.ATTACKED] >= 85
     assert not one.decisions[Decision.CLEAN]
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize(
+    ("feeder", "each"), [("street-9-1", False), ("street-9-1", True), ("street-12-2", False)]
+)
+def test_readings_that_flicker_hide_no_manipulation_that_lasts(feeder: str, *, each: bool) -> None:
+    """All of a third but one change their sign by chance from tick 20 on; the last is off from tick 170 on."""
+    setting, random = Setting(feeder, Model.MATCHED, learned=True, seed=0), np.random.default_rng(10)
+    p = site(feeder).meters.size
+    liars = random.choice(p, p // 3, replace=False)
+    signs = random.choice([-1.0, 1.0], (5000, p // 3 - 1))
+    made, state = begin(setting)
+    named, first = np.zeros(p, dtype=np.bool_), 0
+    for k, (frame, _) in enumerate(play(setting, 190.0)):
+        off = np.zeros(p)
+        off[liars[:-1]] = 0.003 * (k >= 20) * (signs[k] if each else signs[k, 0])
+        off[liars[-1]] = -0.02 * (k >= 170)
+        state, _, verdict = made.step(state, replace(frame, y=frame.y * (1.0 + off) ** 2))
+        named |= verdict.suspects
+        first = first or k * bool(named[liars[-1]])
+        assert k < 175 or verdict.decision is not Decision.CLEAN
+    assert 170 < first < 190
+    assert not np.delete(named, liars).any()

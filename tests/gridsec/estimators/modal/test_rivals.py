@@ -244,7 +244,8 @@ def test_no_onset_after_a_misfit_explains_it() -> None:
     assert len(one.excess) == one.ticks == 40
     assert sum(each for each, _ in one.excess) == pytest.approx(one.misfit)
     assert sum(count for _, count in one.excess) == one.count
-    assert [age for age in range(1, 50) if one.precedes(age)] == list(range(1, 40))
+    assert [age for age in range(1, 50) if one.before(age) > 0.0] == list(range(1, 40))
+    assert one.before(36) == pytest.approx(sum(each for each, _ in one.excess[:4]) - rivals.by_chance(48))
 
 
 STEPS_OF_PLACES = np.vstack([np.zeros((1, 12)), STEPS])
