@@ -483,15 +483,15 @@ def doubted(found: Identification, meters: int) -> float:
 
 
 def _elsewhere(state: CoreState, evidence: Evidence, test: Detector, others: tuple[Rival, ...]) -> bool:
-    """Another onset is far likelier than the pinned ones, by more than the misfit that it leaves before it.
+    """Another onset is far likelier than the pinned ones, and leaves no misfit before it open.
 
     That misfit counts for `WAITS` ticks, in which a short manipulation passes. Later it would hide others.
     """
     by_row, row = evidence.by_row.max(axis=0), int(evidence.rows[0])
-    more = float(by_row[row] - by_row[state.detector.pinned].max())
-    if not others or state.spell > WAITS:
-        return more > FARTHER
-    return more > max(FARTHER, 0.5 * others[0].before(int(test.onsets.age[row])))
+    likelier = by_row[row] > by_row[state.detector.pinned].max() + FARTHER
+    if not likelier or not others or state.spell > WAITS:
+        return bool(likelier)
+    return others[0].before(int(test.onsets.age[row])) <= 0.0
 
 
 def alarmed(core: Core, evidence: Evidence) -> bool:

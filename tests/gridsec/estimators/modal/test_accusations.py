@@ -99,7 +99,7 @@ def test_meters_within_a_wide_deviation_stay_named() -> None:
     ("feeder", "each"), [("street-9-1", False), ("street-9-1", True), ("street-12-2", False)]
 )
 def test_readings_that_flicker_hide_no_manipulation_that_lasts(feeder: str, *, each: bool) -> None:
-    """All of a third but one change their sign by chance from tick 20 on; the last is off from tick 170 on."""
+    """All of a third but one change their sign by chance from tick 20 on; the last is off from 170 on."""
     setting, random = Setting(feeder, Model.MATCHED, learned=True, seed=0), np.random.default_rng(10)
     p = site(feeder).meters.size
     liars = random.choice(p, p // 3, replace=False)
