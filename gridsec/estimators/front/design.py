@@ -81,7 +81,7 @@ class FrontOptions:
     largest_offset_s: float = 15.0
     widest: float = 0.1
     v2_limits: tuple[float, float] = (0.25, 2.25)
-    settled: float = 0.05
+    settled: float = 0.1
 
     def __post_init__(self) -> None:
         positive, zero = (

@@ -245,14 +245,21 @@ def update_injection_error(
 def injection_target(design: FrontDesign, before: InjectionError, given: Floats, width: Floats) -> Floats:
     """Largest errors of the set-points between two frames, (m,), pu.
 
+    given, width: (m,) squared voltage at each input and its largest error, squared pu.
+    """
+    wider, hold = np.maximum(width, before.width), np.abs(given - before.input)
+    return np.asarray(np.minimum(before.span, design.plant.droop.slope * (wider + hold) + design.mismatch))
+
+
+def injection_range(design: FrontDesign, before: InjectionError, given: Floats, width: Floats) -> Floats:
+    """The same by the curves: on a flat part of a curve the inputs do not matter.
+
     Between the frames the input of the observer is in the range [a, b] of both inputs, and the true one at
     most the larger ``width`` W off this range. The curve is monotone, and with ``z = vbar^2 - v^2``
 
         max(K(z(a - W)) - K(z(b)), K(z(a)) - K(z(b + W))) + mismatch
 
-    bounds the error: on a flat part of the curve the inputs do not matter.
-
-    given, width: (m,) squared voltage at each input and its largest error, squared pu.
+    given, width: as in `injection_target`.
     """
     droop, wider = design.plant.droop, np.maximum(width, before.width)
     low, high = np.minimum(given, before.input), np.maximum(given, before.input)

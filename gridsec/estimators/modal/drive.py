@@ -30,7 +30,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, any_of, changed
 from gridsec.estimators.front.design import FrontDesign
 from gridsec.estimators.front.measurements import FrameUncertainty, Measurements, measurements
-from gridsec.estimators.front.observer import injection_target, predict, relaxed
+from gridsec.estimators.front.observer import injection_range, injection_target, predict, relaxed
 from gridsec.estimators.front.state import FrontState, InjectionError, Prediction
 from gridsec.estimators.modal import classes, doubts, verdict
 from gridsec.estimators.modal.core import Core, CoreState
@@ -196,7 +196,8 @@ def followed(  # noqa: PLR0917  # the state, and one frame
     if follow:
         width = np.where(free, SURE * given.last[0].std[front.plant.droop.customer], width)
     target = injection_target(front, before, own.input, width)
-    target = np.where(free, sqrt(3.0) / SURE * target, target)
+    if follow:
+        target = np.where(free, sqrt(3.0) / SURE * injection_range(front, before, own.input, width), target)
     errors = relaxed(front, before, own.input, width, target, h)
     # The voltages have decided that this inverter leaves its curve: its injection says nothing about others.
     return errors if checks.idle else errors.reset(checks.named(front))

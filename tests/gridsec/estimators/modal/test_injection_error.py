@@ -9,7 +9,7 @@ import pytest
 
 from gridsec.arrays import Floats
 from gridsec.estimators.front.design import FrontDesign
-from gridsec.estimators.front.observer import injection_target, relaxed
+from gridsec.estimators.front.observer import injection_range, relaxed
 from gridsec.estimators.front.state import InjectionError
 from tests.gridsec.estimators.modal.streets import prepare
 from tests.gridsec.street import make_plant
@@ -49,7 +49,7 @@ def test_no_injection_is_farther_off_than_its_error(seed: int) -> None:
     for own, other in zip(true, seen, strict=True):
         x = droop(droop.vbar**2 - own) + decay * (x - droop(droop.vbar**2 - own))
         observed = droop(droop.vbar**2 - other) + decay * (observed - droop(droop.vbar**2 - other))
-    target = injection_target(design, before, told[1], width[1])
+    target = injection_range(design, before, told[1], width[1])
     after = relaxed(design, before, told[1], width[1], target, h)
     assert (np.abs(x - observed) <= after.error + 1e-12).all()
     steep = droop.slope * (wider + high - low) + design.mismatch
@@ -62,9 +62,9 @@ def test_an_input_on_a_flat_part_of_the_curve_does_not_matter() -> None:
     flat = 0.5 * (droop.v[:, 1] ** 2 + droop.v[:, 2] ** 2)
     has_one = droop.v[:, 2] > droop.v[:, 1]
     before = begun(design, flat, 0.9 * (droop.v[:, 2] ** 2 - flat))
-    found = injection_target(design, before, before.input, before.width)
+    found = injection_range(design, before, before.input, before.width)
     assert np.allclose(found, design.mismatch, rtol=0.0, atol=1e-15)
-    wider = injection_target(design, before, before.input, 1.5 * before.width)
+    wider = injection_range(design, before, before.input, 1.5 * before.width)
     assert has_one.any()
     assert (wider > design.mismatch + 1e-6)[has_one].all()
 
@@ -77,8 +77,8 @@ def test_an_input_on_a_ramp_counts_by_the_slope() -> None:
     before = begun(design, y, np.full(y.size, 1e-4))
     slope = (droop.q[:, 2] - droop.q[:, 3]) / (droop.v[:, 3] ** 2 - droop.v[:, 2] ** 2)
     moved = replace(before, input=y - 2e-4)
-    target = injection_target(design, moved, y, before.width)
+    target = injection_range(design, moved, y, before.width)
     assert np.allclose(target, slope * 3e-4 + design.mismatch, rtol=1e-9)
-    far = injection_target(design, before, y, np.ones(y.size))
+    far = injection_range(design, before, y, np.ones(y.size))
     whole = droop(droop.vbar**2 - y + 1.0) - droop(droop.vbar**2 - y) + design.mismatch
     assert np.allclose(far, np.minimum(droop.span, whole))
