@@ -251,22 +251,6 @@ def injection_target(design: FrontDesign, before: InjectionError, given: Floats,
     return np.asarray(np.minimum(before.span, design.plant.droop.slope * (wider + hold) + design.mismatch))
 
 
-def injection_range(design: FrontDesign, before: InjectionError, given: Floats, width: Floats) -> Floats:
-    """The same by the curves: on a flat part of a curve the inputs do not matter.
-
-    Between the frames the input of the observer is in the range [a, b] of both inputs, and the true one at
-    most the larger ``width`` W off this range. The curve is monotone, and with ``z = vbar^2 - v^2``
-
-        max(K(z(a - W)) - K(z(b)), K(z(a)) - K(z(b + W))) + mismatch
-
-    given, width: as in `injection_target`.
-    """
-    droop, wider = design.plant.droop, np.maximum(width, before.width)
-    low, high = np.minimum(given, before.input), np.maximum(given, before.input)
-    above, top, bottom, below = droop(droop.vbar**2 - np.stack([low - wider, low, high, high + wider]))
-    return np.asarray(np.minimum(before.span, np.maximum(above - bottom, top - below) + design.mismatch))
-
-
 def relaxed(  # noqa: PLR0917
     design: FrontDesign,
     before: InjectionError,

@@ -290,11 +290,10 @@ def _unsettled(
     droop, N = design.plant.droop, design.customers
     error = droop.per_customer(injected, N) / np.sqrt(3.0)
     usually = design.injections + droop.per_customer(design.mismatch, N)
-    usually = np.maximum(usually, EXACT)
-    far = error > UNSETTLED * usually
+    far = error > UNSETTLED * np.maximum(usually, EXACT)
     out = far
     if any_of(free):
-        out = far | ((droop.per_customer(free.astype(np.float64), N) > 0.0) & (error > usually))
+        out = far | (droop.per_customer(free.astype(np.float64), N) > 0.0)
     out = out & ~metered
     return (np.where(out, error, 0.0), np.where(far, WIDER, FOLLOWS)) if any_of(out) else None
 

@@ -8,13 +8,12 @@ A manipulated reading that drives an inverter of the model moves the residuals o
 with a distrusted meter follows the last estimate, moved by the model. The error of its input has the
 deviation s of the estimate in place of the error of the reading:
 
-    e' = -(e - r / sqrt(3)) / tau,   r = largest change of the curve within 3 s of the input, and mismatch
+    e' = -(e - K sqrt(3) s - mismatch) / tau,   K the slope of the curve
 
-e is a deviation times sqrt(3), as the half-width of an interval is. On a flat part of the curve r is the
-mismatch alone, and the injection is known. The front end's own error of such an inverter is an interval of
-everything possible, for `Estimate.bound`. As a deviation it is far too wide: an injection that is unknown
-hides the readings of its neighbours. While meters collude, the estimate may err by more than its deviation,
-and for long. So e is an unknown direction of the frame (`doubts`), where it exceeds the design's.
+The front end's own error of such an inverter is an interval of everything possible, for `Estimate.bound`.
+As a deviation it is far too wide: an injection that is unknown hides the readings of its neighbours. While
+meters collude, the estimate may err by more than its deviation, and for long. So e is an unknown direction of
+the frame (`doubts`).
 
 A meter that loses its trust at a tick at which it drove its inverter has done so by a false reading. The
 injection is unknown then, and stays so for some time constants of the inverter.
@@ -30,7 +29,7 @@ import numpy as np
 from gridsec.arrays import Bools, Floats, any_of, changed
 from gridsec.estimators.front.design import FrontDesign
 from gridsec.estimators.front.measurements import FrameUncertainty, Measurements, measurements
-from gridsec.estimators.front.observer import injection_range, injection_target, predict, relaxed
+from gridsec.estimators.front.observer import injection_target, predict, relaxed
 from gridsec.estimators.front.state import FrontState, InjectionError, Prediction
 from gridsec.estimators.modal import classes, doubts, verdict
 from gridsec.estimators.modal.core import Core, CoreState
@@ -43,8 +42,6 @@ NEAR = 4.5
 
 The margin is for the flicker of the busbar's meter and the decay of the loads' errors.
 """
-SURE = 3.0
-"""Standard deviations of the estimate within which an inverter's curve is looked at, 1."""
 SHORT = 0.99
 """Least decay of the loads' errors in an interval over which the fit of the last tick counts, 1."""
 LEARNING, RENEWED = 64, 16
@@ -194,10 +191,8 @@ def followed(  # noqa: PLR0917  # the state, and one frame
         # No inverter has followed the estimate so far: the errors are those of the front end.
         return own
     if follow:
-        width = np.where(free, SURE * given.last[0].std[front.plant.droop.customer], width)
+        width = np.where(free, sqrt(3.0) * given.last[0].std[front.plant.droop.customer], width)
     target = injection_target(front, before, own.input, width)
-    if follow:
-        target = np.where(free, sqrt(3.0) / SURE * injection_range(front, before, own.input, width), target)
     errors = relaxed(front, before, own.input, width, target, h)
     # The voltages have decided that this inverter leaves its curve: its injection says nothing about others.
     return errors if checks.idle else errors.reset(checks.named(front))

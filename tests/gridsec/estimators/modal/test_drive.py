@@ -82,19 +82,12 @@ def test_readings_that_alternate_leave_the_injections_known(lies: tuple[int, ...
     usual = front.injections[droop.customer] + front.mismatch
     assert (last.injections.error < np.sqrt(3.0) * doubts.UNSETTLED * usual)[at].all()
     assert (last.injections.error < last.front.injection_error.error)[at].all()
-    # Curves over three deviations of the estimate about the inputs, as sqrt(3) deviations.
+    # At rest, K (sqrt(3) s + |change of the input|) + mismatch: the deviation of the estimate counts.
     before = told[-2][0]
     assert before.front.last is not None
-    width = np.maximum(3.0 * before.front.last[0].std[droop.customer], before.injections.width)
-    ends = np.sort(np.stack([last.injections.input, before.injections.input]), axis=0)
-    curves = list(zip(droop.v**2, droop.q, strict=True))
-
-    def at_inputs(y: Floats) -> Floats:
-        return np.array([np.interp(one, *curve) for one, curve in zip(y, curves, strict=True)])
-
-    lowest = at_inputs(ends[0] - width) - at_inputs(ends[1])
-    highest = at_inputs(ends[0]) - at_inputs(ends[1] + width)
-    aim = np.minimum(droop.span, np.maximum(lowest, highest) + front.mismatch) / np.sqrt(3.0)
+    width = np.sqrt(3.0) * before.front.last[0].std[droop.customer]
+    moved = np.abs(last.injections.input - before.injections.input)
+    aim = droop.slope * (np.maximum(width, before.injections.width) + moved) + front.mismatch
     shown = (last.injections.error - np.exp(-1.0 / droop.tau) * before.injections.error)[at]
     assert np.allclose(shown, ((1.0 - np.exp(-1.0 / droop.tau)) * aim)[at])
 
