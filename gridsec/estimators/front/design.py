@@ -162,6 +162,13 @@ class FrontDesign:
         """One observer for every trusted set."""
         return 1
 
+    @property
+    def drives(self) -> Bools:
+        """Meters with a reading that drives an inverter, (p,)."""
+        out = np.zeros(self.plant.meters.size, dtype=np.bool_)
+        out[self.meter_of[self.meter_of >= 0]] = True
+        return out
+
     def inverters_of(self, meters: Bools) -> Bools:
         """Inverters with a meter that is one of `meters` (p,), (m,)."""
         return np.asarray((self.meter_of >= 0) & meters[self.meter_of])

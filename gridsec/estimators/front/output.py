@@ -22,13 +22,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridsec.arrays import PENDING, Bools, Floats, Ints, deferred
+from gridsec.arrays import PENDING, Bools, Floats, Ints, all_of, any_of, deferred
 from gridsec.estimators.front.design import FrontDesign
-from gridsec.estimators.front.measurements import PowerErrors
+from gridsec.estimators.front.measurements import PowerErrors, largest_offset, unusable_offsets
 from gridsec.estimators.plant import NO_VOLTAGE, Plant, busbar_errors
 from gridsec.grid.devices import told_error
 from gridsec.grid.three_phase import PHASES
-from gridsec.interface import Estimate, Explanation, PowerOrigin
+from gridsec.interface import Cause, Decision, Estimate, Explanation, Frame, PowerOrigin
 
 # --- Sentences ---
 
@@ -124,6 +124,62 @@ def _explanation(design: FrontDesign, explanation: Explanation) -> str:
 def _list(names: list[str]) -> str:
     rest = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + rest
+
+
+# --- Findings ---
+
+Finding = tuple[Decision, Cause, str]
+"""Decision, cause and sentence."""
+_LEAST_V2 = 1e-2
+"""Least squared voltage that relates a standard deviation to the voltage, pu: a dead bus has none."""
+
+
+def unvouched(design: FrontDesign, metered: Bools, used: Bools) -> Finding | None:
+    """UNDECIDED where too few meters report from a phase without a busbar voltage; None elsewhere.
+
+    metered: (b,) phases with a busbar voltage. used: (p,) meters that are compared with each other.
+    """
+    if all_of(metered):
+        return None
+    least = int((design.busbar_incidence > 0.0)[used].sum(axis=0)[~metered].min())
+    most = max(1, min(design.max_attacked, int(used.sum()) // 3))
+    if least > 2 * most:
+        return None
+    sentence = (
+        f"The busbar voltage of a phase is missing, and {least} meters report from there; "
+        f"at least {2 * most + 1} are needed to tell {most} manipulated from the others."
+    )
+    return Decision.UNDECIDED, Cause.TOO_FEW_METERS, sentence
+
+
+def imprecise(design: FrontDesign, frame: Frame, unread: Bools, estimate: Estimate) -> Finding | None:
+    """UNDECIDED where a voltage beside an unread power is too uncertain; None elsewhere.
+
+    unread: (p,) meters with a reading beside an unread power.
+    """
+    if not any_of(unread):
+        return None
+    at, limit = design.plant.meters, design.options.unread_std_percent
+    v = np.sqrt(np.maximum(estimate.v2[at], _LEAST_V2))
+    percent = 50.0 * estimate.std[at] / (v * design.plant.droop.vbar)
+    wide = unread & ~(percent <= limit)
+    if not any_of(wide):
+        return None
+    origins = np.zeros(frame.p.size, dtype=np.intp) if frame.p_origin is None else frame.p_origin
+    sentence = unread_sentence(design.names, wide, origins[at], percent, limit)
+    return Decision.UNDECIDED, Cause.MISSING_POWERS, sentence
+
+
+def with_clock_offsets(design: FrontDesign, frame: Frame, available: Bools, finding: Finding) -> Finding:
+    """The meters that count as silent for their clock offset, in the sentence; available: (p,)."""
+    decision, cause, reason = finding
+    far = unusable_offsets(design, frame.clock_offset)
+    if far is None or cause not in (Cause.SILENT_METERS, Cause.TOO_FEW_METERS):
+        return finding
+    sentence = clock_sentence(design.names, far, largest_offset(design))
+    if cause is Cause.SILENT_METERS and not any_of(~available & ~far):
+        return decision, Cause.CLOCK_OFFSET, sentence
+    return decision, cause, f"{reason} {sentence}"
 
 
 # --- Bound of the estimate ---

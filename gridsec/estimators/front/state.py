@@ -24,7 +24,7 @@ from gridsec.estimators.front.measurements import (
     nominal_uncertainty,
 )
 from gridsec.estimators.front.meter_bias import Commission, Learned, Learning, initial
-from gridsec.estimators.plant import NO_VOLTAGE, Plant
+from gridsec.estimators.plant import NO_VOLTAGE, Plant, nothing_new
 from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.lure import Lure, LureTransition
 
@@ -123,6 +123,15 @@ class FrontState:
     inverter_checks: InverterChecks  # comparison of metered reactive powers with the droop curves
     attack_kinds: AttackKinds  # reading history and kinds of the manipulations
     last: tuple[Estimate, Verdict] | None  # last output
+
+
+def repeated(design: FrontDesign, state: FrontState, frame: Frame) -> tuple[Estimate, Verdict] | None:
+    """Answer of `plant.nothing_new` to a frame that is not later than the last one; None for a later one."""
+    if np.isfinite(frame.t) and (state.x is None or frame.t > state.t):
+        return None
+    none = np.zeros(design.plant.droop.tau.size)
+    estimate, answer = nothing_new(design.plant, frame, state.t, state.last, state.v0_squared, none)
+    return (replace(estimate, std=estimate.bound) if state.last is None else estimate), answer
 
 
 def init(

@@ -391,11 +391,15 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
     return replace(now, masked=masking.added(state.masked, named, amount[: named.size])), evidence
 
 
+Change = Callable[[int, Bools | None, Floats | None], tuple[Bools | None, Floats | None]]
+"""Meters with a reading and unknown directions of a replayed tick, by its number and those that are kept."""
+
+
 def again(
     core: Core,
     state: CoreState,
     first: int,
-    change: Callable[[int, Bools | None, Floats | None], tuple[Bools | None, Floats | None]],
+    change: Change,
     begun: FilterState | None = None,
 ) -> tuple[CoreState, Evidence]:
     """Replay of kept readings with others in place of some, without a pinned onset; no meter is masked.
@@ -427,6 +431,15 @@ def again(
         now, evidence = step(core, now, t, m, *change(k, seen, unknown), jump)
     # The loads have varied once.
     return replace(now, loads=state.loads), evidence
+
+
+def unknown_along(columns: Floats, first: int, end: int) -> Change:
+    """Change of `again` with more unknown directions, (p, k), from reading `first` to before `end`."""
+
+    def change(k: int, seen: Bools | None, unknown: Floats | None) -> tuple[Bools | None, Floats | None]:
+        return seen, replay.beside(unknown, columns) if first <= k < end else unknown
+
+    return change
 
 
 def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
@@ -676,12 +689,7 @@ def passed(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreStat
     if not length or not length + PASSED <= age <= len(readings) or without < DOUBT:
         return None
     first, apart = len(readings) - age, rivals.APART * np.eye(core.modes.size)
-
-    def apart_at(k: int, seen: Bools | None, unknown: Floats | None) -> tuple[Bools | None, Floats | None]:
-        inside = first <= k < first + length
-        return seen, (apart if unknown is None else np.hstack([unknown, apart])) if inside else unknown
-
-    now, evidence = again(core, state, first, apart_at)
+    now, evidence = again(core, state, first, unknown_along(apart, first, first + length))
     if now.detector.log_m >= CALM * core.limit:
         return None
     return replace(now, masked=state.masked), evidence

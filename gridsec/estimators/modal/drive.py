@@ -142,9 +142,7 @@ def driven(  # noqa: PLR0917  # the state, and one frame
         far = np.abs(verdict.offsets(core, state, m, gap)) > JUMP * core.modes.noise_std
     if not any_of(far):
         return given, measured, predicted
-    drives = np.zeros(m.size, dtype=np.bool_)
-    drives[front.meter_of[front.meter_of >= 0]] = True
-    drives &= measured.available & given.trust.trusted
+    drives = front.drives & measured.available & given.trust.trusted
     if not any_of(drives & far):
         return given, measured, predicted
     nu, std = verdict.deviations(core, state, m, gap)

@@ -82,7 +82,7 @@ from gridsec.estimators.modal.estimate import Reconstructed, Spread
 from gridsec.estimators.modal.naming import CONFIRM, alone, final
 from gridsec.estimators.modal.record import Record
 from gridsec.estimators.modal.search import DOUBT
-from gridsec.estimators.plant import Plant, nothing_new
+from gridsec.estimators.plant import Plant
 from gridsec.interface import Estimate, Frame, Verdict
 from gridsec.observers.certificates import Certificate
 
@@ -257,10 +257,9 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     A frame that is not later than the last one changes nothing: it repeats the last estimate, with UNDECIDED.
     """
     front, given = design.front, state.front
-    if not np.isfinite(frame.t) or (given.x is not None and not frame.t > given.t):
-        none = np.zeros(front.plant.droop.tau.size)
-        estimate, answer = nothing_new(front.plant, frame, given.t, given.last, given.v0_squared, none)
-        return state, (replace(estimate, std=estimate.bound) if given.last is None else estimate), answer
+    repeated = front_state.repeated(front, given, frame)
+    if repeated is not None:
+        return state, *repeated
     history, frame = without_shifted_busbar(
         front, given.busbar_history, plausible(front, frame), given.trust.trusted, given.v0_squared
     )
@@ -442,13 +441,9 @@ def _without_busbar(
     named = np.zeros(H.shape[1], dtype=np.bool_)
     named[H.any(axis=0)] = which
     columns = doubts.WIDER * UNMETERED * H[:, named]
-    first = len(kernel.history.readings) - int(kernel.detector.onsets.age[suspicion.row])
-
-    def unmetered(k: int, seen: Bools | None, unknown: Floats | None) -> tuple[Bools | None, Floats | None]:
-        more = columns if unknown is None else np.hstack([unknown, columns])
-        return seen, unknown if k < first else more
-
-    now, evidence = core.again(design.core, kernel, first, unmetered)
+    count = len(kernel.history.readings)
+    first = count - int(kernel.detector.onsets.age[suspicion.row])
+    now, evidence = core.again(design.core, kernel, first, core.unknown_along(columns, first, count))
     after = replace(
         state,
         front=changed(state.front, busbar=_suspected_busbar(state.front.busbar, named)),

@@ -67,6 +67,11 @@ class Suspected:
         return Joint(self.score @ back, back.T @ self.information @ back, shift, self.level)
 
 
+def beside(unknown: Floats | None, columns: Floats) -> Floats:
+    """Unknown directions of a tick with more of them, (t, k)."""
+    return columns if unknown is None else np.hstack([unknown, columns])
+
+
 Parts = tuple[FilterState, Static, Detector, tuple[Suspected, ...]]
 
 

@@ -244,8 +244,7 @@ def transitions(modes: Modes, history: History, age: int, *, ramp: bool = False)
         if k < 0:
             within = follow(within, t, m, seen, unknown, jump)
         elif k < age - 1:
-            wide = apart if unknown is None else np.hstack([unknown, apart])
-            within = follow(within, t, m, seen, wide, jump, begun=k == 0)
+            within = follow(within, t, m, seen, replay.beside(unknown, apart), jump, begun=k == 0)
             if (k + 1) & k == 0:
                 out.append(replace(within, transition=k + 1, misfit=0.0, count=0))
     return tuple(out)

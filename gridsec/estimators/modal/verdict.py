@@ -29,14 +29,15 @@ from gridsec.arrays import PENDING, Bools, Floats, all_of, any_of, deferred, ind
 from gridsec.estimators.detection import AGREEMENT, DecisionInputs, decide
 from gridsec.estimators.front.design import FrontDesign
 from gridsec.estimators.front.device_checks import probability
-from gridsec.estimators.front.measurements import largest_offset, unusable_offsets
 from gridsec.estimators.front.output import (
+    Finding,
     busbar_deviation,
     busbar_meter,
-    clock_sentence,
     explanations_sentence,
     fault_sentence,
-    unread_sentence,
+    imprecise,
+    unvouched,
+    with_clock_offsets,
 )
 from gridsec.estimators.modal import detector, masking, signatures
 from gridsec.estimators.modal import filter as modal
@@ -54,10 +55,6 @@ LIKELY = 0.01
 """Weight from which on an explanation is reported, 1."""
 SHOWN = 20
 """Largest number of reported explanations."""
-LEAST_V2 = 1e-2
-"""Least squared voltage that relates a standard deviation to the voltage, pu."""
-
-Finding = tuple[Decision, Cause, str]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -487,29 +484,16 @@ def verdict(design: FrontDesign, now: Inputs, estimate: Estimate) -> Finding:
             busbar=True,
         )
     )
-    finding = _unvouched(design, now, tested, finding)
+    if finding[0] is Decision.CLEAN:
+        finding = unvouched(design, np.atleast_1d(now.metered), tested) or finding
     finding = _busbar(design, now, estimate, finding)
     if now.suspected:
         finding = _suspected(design, now, finding)
     finding = _doubted(design, now, finding)
     finding = _inverters(design, now, finding)
-    return _clock(design, now, tested, _unread_powers(design, now, estimate, finding))
-
-
-def _unvouched(design: FrontDesign, now: Inputs, tested: Bools, finding: Finding) -> Finding:
-    """UNDECIDED where too few meters report from a phase without a busbar voltage."""
-    if finding[0] is not Decision.CLEAN or all_of(now.metered):
-        return finding
-    count = (design.busbar_incidence > 0.0)[tested].sum(axis=0)
-    least = int(np.where(now.metered, tested.size, count).min())
-    most = max(1, min(design.max_attacked, int(tested.sum()) // 3))
-    if least > 2 * most:
-        return finding
-    sentence = (
-        f"The busbar voltage of a phase is missing, and {least} meters report from there; "
-        f"at least {2 * most + 1} are needed to tell {most} manipulated from the others."
-    )
-    return Decision.UNDECIDED, Cause.TOO_FEW_METERS, sentence
+    if finding[1] in (Cause.AGREEMENT, Cause.SILENT_METERS):
+        finding = imprecise(design, now.frame, now.unread & now.seen, estimate) or finding
+    return with_clock_offsets(design, now.frame, tested, finding)
 
 
 def _busbar(design: FrontDesign, now: Inputs, estimate: Estimate, finding: Finding) -> Finding:
@@ -614,32 +598,3 @@ def _one_power(design: FrontDesign, suspicion: Suspicion, one: Explanation) -> s
             # A missing injection lowers the voltages: the residual is that of the true power.
             return fault_sentence(design, power, float(mean[0]))
     return ""
-
-
-def _unread_powers(design: FrontDesign, now: Inputs, estimate: Estimate, finding: Finding) -> Finding:
-    """UNDECIDED where a voltage beside an unread power is too uncertain."""
-    unread = now.unread & now.seen
-    if finding[1] not in (Cause.AGREEMENT, Cause.SILENT_METERS) or not any_of(unread):
-        return finding
-    at, limit = design.plant.meters, design.options.unread_std_percent
-    v = np.sqrt(np.maximum(estimate.v2[at], LEAST_V2))
-    percent = 50.0 * estimate.std[at] / (v * design.plant.droop.vbar)
-    wide = unread & ~(percent <= limit)
-    if not any_of(wide):
-        return finding
-    frame = now.frame
-    origins = np.zeros(frame.p.size, dtype=np.intp) if frame.p_origin is None else frame.p_origin
-    sentence = unread_sentence(design.names, wide, origins[at], percent, limit)
-    return Decision.UNDECIDED, Cause.MISSING_POWERS, sentence
-
-
-def _clock(design: FrontDesign, now: Inputs, tested: Bools, finding: Finding) -> Finding:
-    """The meters that count as silent for a clock offset beyond every scale, in the sentence."""
-    decision, cause, reason = finding
-    far = unusable_offsets(design, now.frame.clock_offset)
-    if far is None or cause not in (Cause.SILENT_METERS, Cause.TOO_FEW_METERS):
-        return finding
-    sentence = clock_sentence(design.names, far, largest_offset(design))
-    if cause is Cause.SILENT_METERS and not indices(~tested & ~far).size:
-        return decision, Cause.CLOCK_OFFSET, sentence
-    return decision, cause, f"{reason} {sentence}"

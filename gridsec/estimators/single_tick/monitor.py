@@ -52,10 +52,8 @@ from gridsec.estimators.front.measurements import (
     PowerErrors,
     checked,
     frame_prior,
-    largest_offset,
     measurements,
     plausible,
-    unusable_offsets,
     update_skew,
     update_uncertainty,
     without_shifted_busbar,
@@ -64,9 +62,11 @@ from gridsec.estimators.front.observer import predict
 from gridsec.estimators.front.output import (
     BoundedEstimate,
     BoundInputs,
-    clock_sentence,
+    Finding,
     explanations_sentence,
-    unread_sentence,
+    imprecise,
+    unvouched,
+    with_clock_offsets,
 )
 from gridsec.estimators.front.posterior import (
     UNMETERED,
@@ -76,8 +76,8 @@ from gridsec.estimators.front.posterior import (
     condition,
     leave_one_out,
 )
-from gridsec.estimators.front.state import Prediction
-from gridsec.estimators.plant import NO_VOLTAGE, Options, Plant, busbar_errors, nothing_new, usual_options
+from gridsec.estimators.front.state import Prediction, repeated
+from gridsec.estimators.plant import NO_VOLTAGE, Options, Plant, busbar_errors, usual_options
 from gridsec.estimators.single_tick.decoders import (
     RIVAL_RATIO,
     Decoder,
@@ -101,7 +101,6 @@ class SingleTickDesign:
     front: FrontDesign  # prior of the voltages, observer of the inverters, accuracy of the meters
     decoder: Decoder
     noise: Floats = field(repr=False)  # (p,) variance of a reading, fixed error included, squared pu^2
-    drives: Bools = field(repr=False)  # (p,) meters with a reading that drives an inverter
     options: Options = field(repr=False)  # sigmas, confirm, release, settled and widest count
 
     @property
@@ -166,13 +165,10 @@ def design(
     if decoder is fewest:
         check(p, max_attacked)
     tail = min(alarms_per_year * step_s / (YEAR_S * 2 * p), 0.5)
-    drives = np.zeros(p, dtype=np.bool_)
-    drives[front.meter_of[front.meter_of >= 0]] = True
     return SingleTickDesign(
         front=front,
         decoder=decoder,
         noise=front.white + front.fixed,
-        drives=drives,
         options=replace(usual_options(step_s), sigmas=-float(ndtri(0.5 * tail))),
     )
 
@@ -195,16 +191,15 @@ def step(
     A frame that is not later than the last one changes nothing: it repeats the last estimate, with UNDECIDED.
     """
     front, given = design.front, state.front
-    if not np.isfinite(frame.t) or (given.x is not None and not frame.t > given.t):
-        none = np.zeros(front.plant.droop.tau.size)
-        estimate, answer = nothing_new(front.plant, frame, given.t, given.last, given.v0_squared, none)
-        return state, (replace(estimate, std=estimate.bound) if given.last is None else estimate), answer
+    answered = repeated(front, given, frame)
+    if answered is not None:
+        return state, *answered
     trusted = given.trust.trusted
     history, frame = without_shifted_busbar(
         front, given.busbar_history, plausible(front, frame), trusted, given.v0_squared
     )
     tick = _decoded(design, state, frame, trusted)
-    driving = tick.possible & design.drives & trusted
+    driving = tick.possible & front.drives & trusted
     if any_of(driving):
         # The injections follow these readings, and the residuals of all other meters follow the injections.
         tick = _decoded(design, state, frame, trusted & ~driving)
@@ -445,8 +440,6 @@ def _estimate(design: SingleTickDesign, tick: _Tick, left: _Left) -> Estimate:
 
 # --- Verdict ---
 
-_Finding = tuple[Decision, Cause, str]
-
 
 def _verdict(
     design: SingleTickDesign, tick: _Tick, left: _Left, accused: tuple[Bools, Bools], estimate: Estimate
@@ -460,11 +453,14 @@ def _verdict(
     if rivals and finding[1] in (Cause.AGREEMENT, Cause.AMBIGUOUS):
         finding = Decision.UNDECIDED, Cause.AMBIGUOUS, explanations_sentence(front, rivals)
     finding = _unexplained(left, finding)
-    finding = _of_busbar(design, tick, left, finding)
-    finding = _unread_powers(design, tick, estimate, finding)
+    if finding[0] is Decision.CLEAN:
+        finding = unvouched(front, np.atleast_1d(measured.busbar_metered), left.posterior.trusted) or finding
+    if finding[0] is Decision.CLEAN and measured.frame.p_origin is not None:
+        unread = ~tick.uncertainty.vouched & measured.available
+        finding = imprecise(front, measured.frame, unread, estimate) or finding
     off = measured.y - estimate.v2_bus[front.prior.meters]
     return Verdict(
-        *_clock_offsets(front, measured, finding),
+        *with_clock_offsets(front, measured.frame, measured.available, finding),
         named,
         np.where(measured.available, residual, np.nan),
         left.limit,
@@ -476,7 +472,7 @@ def _verdict(
     )
 
 
-def _of_meters(design: SingleTickDesign, tick: _Tick, left: _Left, named: Bools, suspect: Bools) -> _Finding:
+def _of_meters(design: SingleTickDesign, tick: _Tick, left: _Left, named: Bools, suspect: Bools) -> Finding:
     """Verdict on the meters; named, suspect: (p,)."""
     front, available = design.front, tick.measured.available
     most = max(1, min(front.max_attacked, int(np.count_nonzero(available)) // 3))
@@ -491,7 +487,7 @@ def _of_meters(design: SingleTickDesign, tick: _Tick, left: _Left, named: Bools,
             wide=available & ~(left.limit <= design.options.widest),
             valid=True,
             settled=settled,
-            # A missing busbar voltage is an unknown of the prior, see `_of_busbar`.
+            # A missing busbar voltage is an unknown of the prior, see `unvouched`.
             busbar=True,
         )
     )
@@ -507,7 +503,7 @@ def _of_meters(design: SingleTickDesign, tick: _Tick, left: _Left, named: Bools,
     return Decision.UNDECIDED, Cause.TOO_MANY_SUSPECTS, sentence
 
 
-def _unsolved(tick: _Tick, finding: _Finding) -> _Finding:
+def _unsolved(tick: _Tick, finding: Finding) -> Finding:
     """UNDECIDED where the decoder finds no solution."""
     if tick.answers or finding[0] is not Decision.CLEAN:
         return finding
@@ -535,7 +531,7 @@ def _rivals(design: SingleTickDesign, tick: _Tick, left: _Left) -> tuple[Explana
     return tuple(Explanation(meters, inverters, chance, busbar=phase) for (_, meters, phase), chance in pairs)
 
 
-def _unexplained(left: _Left, finding: _Finding) -> _Finding:
+def _unexplained(left: _Left, finding: Finding) -> Finding:
     """UNDECIDED where the meters that are left disagree with the feeder."""
     decision, cause, reason = finding
     if not left.misfit:
@@ -546,52 +542,3 @@ def _unexplained(left: _Left, finding: _Finding) -> _Finding:
         return finding
     sentence = "The meters, taken together, disagree with the feeder by more than chance."
     return Decision.UNDECIDED, Cause.MISFIT, sentence
-
-
-def _of_busbar(design: SingleTickDesign, tick: _Tick, left: _Left, finding: _Finding) -> _Finding:
-    """UNDECIDED where too few meters report from a phase without a busbar voltage."""
-    if finding[0] is not Decision.CLEAN:
-        return finding
-    front, metered = design.front, np.atleast_1d(tick.measured.busbar_metered)
-    most = max(1, min(front.max_attacked, int(np.count_nonzero(left.posterior.trusted)) // 3))
-    reporting = (front.busbar_incidence[left.posterior.trusted] > 0.0).sum(axis=0)
-    few = reporting[~metered]
-    if not any_of(few <= 2 * most):
-        return finding
-    sentence = (
-        f"The busbar voltage of a phase is missing, and {few.min()} meters report from there; "
-        f"at least {2 * most + 1} are needed to tell {most} manipulated from the others."
-    )
-    return Decision.UNDECIDED, Cause.TOO_FEW_METERS, sentence
-
-
-def _unread_powers(design: SingleTickDesign, tick: _Tick, estimate: Estimate, finding: _Finding) -> _Finding:
-    """UNDECIDED where the voltage beside an unread power is too uncertain."""
-    front, origins = design.front, tick.measured.frame.p_origin
-    if finding[0] is not Decision.CLEAN or origins is None:
-        return finding
-    unread = ~tick.uncertainty.vouched & tick.measured.available
-    at, limit = front.plant.meters, front.options.unread_std_percent
-    v = np.sqrt(np.maximum(estimate.v2[at], _LEAST_V2))
-    percent = 50.0 * estimate.std[at] / (v * front.plant.droop.vbar)
-    wide = unread & ~(percent <= limit)
-    if not any_of(wide):
-        return finding
-    sentence = unread_sentence(front.names, wide, origins[at], percent, limit)
-    return Decision.UNDECIDED, Cause.MISSING_POWERS, sentence
-
-
-_LEAST_V2 = 1e-2
-"""Least squared voltage that relates a standard deviation to the voltage, pu: a dead bus has none."""
-
-
-def _clock_offsets(front: FrontDesign, measured: Measurements, finding: _Finding) -> _Finding:
-    """Verdict with the meters that count as silent for their clock offset."""
-    decision, cause, reason = finding
-    far = unusable_offsets(front, measured.frame.clock_offset)
-    if far is None or cause not in (Cause.SILENT_METERS, Cause.TOO_FEW_METERS):
-        return finding
-    sentence = clock_sentence(front.names, far, largest_offset(front))
-    if cause is Cause.SILENT_METERS and not any_of(~measured.available & ~far):
-        return decision, Cause.CLOCK_OFFSET, sentence
-    return decision, cause, f"{reason} {sentence}"
