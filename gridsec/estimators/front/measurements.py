@@ -26,7 +26,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, all_of, any_of
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
 from gridsec.estimators.front.design import FrontDesign
 from gridsec.estimators.front.posterior import (
     EXACT,
@@ -210,33 +210,97 @@ def unusable_offsets(design: FrontDesign, offset_s: Floats | None) -> Bools | No
     return far if any_of(far) else None
 
 
+_MOVED = 0.5
+"""Least change of a voltage by a power that counts for itself, in white deviations, 1."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ClockSkew:
-    """Changes of the voltages within the clock offsets. p meters."""
+    """Changes of the voltages within the clock offsets. k ticks, the newest last, p meters.
 
-    model: Floats  # (k, p) squared voltages of the model at the last ticks, the newest last, pu
-    change: Floats  # (p,) c at the last tick, squared pu
+    The clock of meter j is ahead by o_j. At a tick its reading lags the power of customer i by ``o_j - o_i``,
+    and the busbar and all others by o_j. With a positive lag it lacks changes of the last ticks. With a
+    negative one it has changes of the next ticks.
+    """
+
+    model: Floats  # (k, p) squared voltages of the model, pu
+    powers: Floats  # (k, 2 p) active and reactive injections of the metered customers, pu
+    change: Floats  # (p,) largest change to the last tick within a positive lag, squared pu
+    later: Floats  # (k, p) largest changes from these ticks to later ones within a negative lag, squared pu
+    wait: int  # K of the largest offset: ticks until a step of the busbar is known
 
 
 def update_skew(
-    design: FrontDesign, before: ClockSkew | None, offset_s: Floats | None, v2: Floats
+    design: FrontDesign, before: ClockSkew | None, offset_s: Floats | None, frame: Frame, v2: Floats
 ) -> ClockSkew | None:
     """Changes with one more tick; None without a measured offset.
 
+        change_j(t) = max |x_j(t) - x_j(t - k)|,  later_j(t) = max |x_j(t + k) - x_j(t)|,  1 <= k <= K
+
+    ``K = ceil(|lag| / step_s) + 1``. x is the contribution of one power with an offset, or that of all else.
     offset_s: (p,) lead of each clock, s, NaN if not measurable; offsets beyond `largest_offset` count as
     none. v2: (p,) voltages of the model, squared pu.
     """
-    size = np.zeros(v2.size) if offset_s is None else np.abs(np.nan_to_num(offset_s))
-    size = np.where(size <= largest_offset(design), size, 0.0)
-    if not any_of(size):
+    lead = np.zeros(v2.size) if offset_s is None else np.nan_to_num(offset_s)
+    lead = np.where(np.abs(lead) <= largest_offset(design), lead, 0.0)
+    if not any_of(lead):
         return None
-    ticks = np.where(size > 0.0, np.ceil(size / design.step_s) + 1.0, 0.0)
-    old = np.zeros((0, v2.size)) if before is None else before.model
-    change = np.zeros(v2.size)
-    for k in range(1, min(int(ticks.max()), len(old)) + 1):
-        change = np.where(ticks >= k, np.maximum(change, np.abs(v2 - old[-k])), change)
-    kept = ceil(largest_offset(design) / design.step_s) + 1
-    return ClockSkew(np.vstack([old, v2])[-kept:], change)
+    wait = int(_window(design, lead).max())
+    powers = np.concatenate([frame.p[design.plant.meters], frame.q[design.plant.meters]])
+    if before is None:
+        none = np.zeros((1, v2.size))
+        return ClockSkew(v2[None], powers[None], none[0], none, wait)
+    # Row k - 1: changes from k ticks ago.
+    rest, change, later = v2 - before.model[::-1], np.zeros(v2.size), before.later[::-1].copy()
+    moved = powers - before.powers[::-1]
+    for i in _moved(design, moved, lead).tolist():
+        of_power = moved[:, [i, v2.size + i]] @ _effect(design, i)
+        rest = rest - of_power
+        change, later = _widened(design, change, later, of_power, lead - lead[i])
+    change, later = _widened(design, change, later, rest, lead)
+    kept = _window(design, np.array([2.0 * largest_offset(design)]))[0]
+    return ClockSkew(
+        np.vstack([before.model, v2])[-kept:],
+        np.vstack([before.powers, powers])[-kept:],
+        change,
+        np.vstack([later[::-1], np.zeros(v2.size)])[-kept:],
+        wait,
+    )
+
+
+def _moved(design: FrontDesign, moved: Floats, lead: Floats) -> Ints:
+    """Meters with a clock offset and powers that have moved (k, 2 p) by more than jitter."""
+    p = lead.size
+    most = np.abs(moved).max(axis=0)
+    effect = most[:p] * design.references.active + most[p:] * design.references.reactive
+    return np.flatnonzero((lead != 0.0) & (effect > _MOVED * np.sqrt(design.white)))
+
+
+def _effect(design: FrontDesign, meter: int) -> Floats:
+    """Effect of the powers of a metered customer on all meters, (2, p), squared pu per pu."""
+    customer = int(design.plant.meters[meter])
+    which = np.array([customer, design.customers + customer])
+    return np.asarray(design.sensitivities.numbered(which)[design.prior.meters].T)
+
+
+def _window(design: FrontDesign, lag: Floats) -> Ints:
+    """K of each lag, s; 0 without a lag."""
+    ticks = np.ceil(np.abs(lag) / design.step_s) + 1.0
+    return np.where(lag != 0.0, ticks, 0.0).astype(np.intp)
+
+
+def _widened(
+    design: FrontDesign, change: Floats, later: Floats, moved: Floats, lag: Floats
+) -> tuple[Floats, Floats]:
+    """`change`, and `later` with the newest first, with one source.
+
+    moved, lag: (k, p) changes of the source, the newest first, squared pu, and (p,) lags behind it, s. They
+    stand for those of the next ticks as well.
+    """
+    ago, window = np.arange(1, len(moved) + 1)[:, None], _window(design, lag)
+    size = np.where(ago <= window, np.abs(moved), 0.0)
+    later = np.maximum(later, np.where(lag < 0.0, size, 0.0))
+    return np.maximum(change, size.max(axis=0, initial=0.0)), later
 
 
 # --- Busbar readings ---

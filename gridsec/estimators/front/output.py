@@ -24,7 +24,12 @@ import numpy as np
 
 from gridsec.arrays import PENDING, Bools, Floats, Ints, all_of, any_of, deferred
 from gridsec.estimators.front.design import FrontDesign
-from gridsec.estimators.front.measurements import PowerErrors, largest_offset, unusable_offsets
+from gridsec.estimators.front.measurements import (
+    ClockSkew,
+    PowerErrors,
+    largest_offset,
+    unusable_offsets,
+)
 from gridsec.estimators.plant import NO_VOLTAGE, Plant, busbar_errors
 from gridsec.grid.devices import told_error
 from gridsec.grid.three_phase import PHASES
@@ -91,6 +96,14 @@ def clock_sentence(names: tuple[str, ...], which: Bools, limit_s: float) -> str:
     found = _list([name for name, one in zip(names, which, strict=True) if one])
     return (
         f"The clock offset of {found} is above {limit_s:g} s: no scale compares the readings with the feeder."
+    )
+
+
+def moved_sentence(names: tuple[str, ...], which: Bools) -> str:
+    """Meters `which` (p,) with a voltage that changes within the clock offsets."""
+    found = _list([name for name, one in zip(names, which, strict=True) if one])
+    return (
+        f"The voltage of {found} changes within the measured clock offsets by more than the accuracy class."
     )
 
 
@@ -170,9 +183,20 @@ def imprecise(design: FrontDesign, frame: Frame, unread: Bools, estimate: Estima
     return Decision.UNDECIDED, Cause.MISSING_POWERS, sentence
 
 
-def with_clock_offsets(design: FrontDesign, frame: Frame, available: Bools, finding: Finding) -> Finding:
-    """The meters that count as silent for their clock offset, in the sentence; available: (p,)."""
+def with_clock_offsets(
+    design: FrontDesign, frame: Frame, available: Bools, skew: ClockSkew | None, finding: Finding
+) -> Finding:
+    """The finding with the meters that clock offsets keep from a comparison.
+
+    Meters with an unusable offset count as silent, and are in the sentence. A change within usable offsets by
+    more than the accuracy class is UNDECIDED in place of CLEAN. available: (p,) meters with a reading.
+    """
     decision, cause, reason = finding
+    if decision is Decision.CLEAN and skew is not None:
+        moved = available & (skew.change > design.allowed)
+        if not any_of(moved):
+            return finding
+        return Decision.UNDECIDED, Cause.CLOCK_OFFSET, moved_sentence(design.names, moved)
     far = unusable_offsets(design, frame.clock_offset)
     if far is None or cause not in (Cause.SILENT_METERS, Cause.TOO_FEW_METERS):
         return finding

@@ -81,6 +81,10 @@ FARTHEST = 10.0
 """Largest variance of a jump of one tick, in that of the loads, 1: a power over three times the usual."""
 SKEWED = 0.5
 """Change of a voltage within a clock offset from which on the reading is unknown, in white deviations, 1."""
+LATER = 3.0
+"""The same for changes after a reading, 1. The kept readings are replayed with it, which takes time."""
+GROWN = 1.5
+"""Growth of such a change from which on they are replayed again, 1: a step has one or two."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -306,10 +310,40 @@ def _clocks(design: FrontDesign, measured: Measurements, skew: ClockSkew | None)
     moved = measured.available & (change > SKEWED * np.sqrt(design.white))
     if not any_of(moved):
         return None
-    at = indices(moved)
-    out = np.zeros((change.size, at.size))
-    out[at, np.arange(at.size)] = change[at]
+    return singly(np.where(moved, change, 0.0))
+
+
+def singly(std: Floats) -> Floats:
+    """Directions of the meters with a standard deviation (p,), one for each, (p, k)."""
+    at = np.flatnonzero(std)
+    out = np.zeros((std.size, at.size))
+    out[at, np.arange(at.size)] = std[at]
     return out
+
+
+def earlier(design: FrontDesign, before: ClockSkew | None, now: ClockSkew | None) -> Floats | None:
+    """Changes of the voltages after the ticks before the last one, clocks that are behind; None for none new.
+
+    Parameters
+    ----------
+    design
+        The front end.
+    before, now
+        Changes of the voltages before and after the last tick.
+
+    Returns
+    -------
+    (k, p)
+        Standard deviations that the readings of the last k ticks gain, the newest last, squared pu.
+    """
+    if before is None or now is None or not now.wait:
+        return None
+    later = now.later[:-1]
+    known, limit = before.later[len(before.later) - len(later) :], LATER * np.sqrt(design.white)
+    new: Bools = np.asarray((later > limit) & (later > GROWN * known))
+    if not any_of(new):
+        return None
+    return np.where(new, later, 0.0)[int(np.flatnonzero(new.any(axis=1))[0]) :]
 
 
 def estimated(

@@ -74,7 +74,7 @@ from gridsec.estimators.front.state import (
     Prediction,
     SuspicionRecord,
 )
-from gridsec.estimators.modal import classes, core, doubts, drive, full, masking, record, verdict
+from gridsec.estimators.modal import classes, core, doubts, drive, full, masking, record, replay, verdict
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.doubts import Movements, Unknown
@@ -280,7 +280,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     v2 = predicted.v2_bus[front.prior.meters]
     skew = given.clock_skew
     if skew is not None or frame.clock_offset is not None:
-        skew = update_skew(front, skew, frame.clock_offset, v2)
+        skew = update_skew(front, skew, frame.clock_offset, measured.frame, v2)
     kinds = ingest(front.references, given.attack_kinds, measured.y, measured.available)
     now = changed(
         given,
@@ -296,6 +296,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     m = measured.y - drive.expected(v2, state.fit.own)
     if not whole:
         m = np.where(seen, m, 0.0)
+    state = _moved_later(design, state, doubts.earlier(front, given.clock_skew, skew))
     kernel = _begun_anew(design, state, frame.t) if open_ is None and whole else state.core
     kernel, evidence = core.step(
         design.core,
@@ -344,6 +345,23 @@ def _repeating(state: CoreState, which: Bools) -> CoreState:
     return replace(state, masked=masking.added(state.masked, which)) if any_of(which) else state
 
 
+def _moved_later(design: ModalDesign, state: ModalState, moved: Floats | None) -> ModalState:
+    """State after the last readings, with the standard deviations (k, p) that these gain; None: none."""
+    kernel = state.core
+    count = len(kernel.history.readings)
+    if moved is None or not count:
+        return state
+
+    def wider(k: int, seen: Bools | None, unknown: Floats | None) -> tuple[Bools | None, Floats | None]:
+        now = k - count
+        return seen, unknown if now < -len(moved) else replay.beside(unknown, doubts.singly(moved[now]))
+
+    kernel = replace(
+        core.again(design.core, kernel, max(0, count - len(moved)), wider)[0], masked=kernel.masked
+    )
+    return _unsuspected(replace(state, core=kernel))
+
+
 # --- Identification ---
 
 
@@ -357,6 +375,10 @@ def _identified(
     if suspicion is not None and not (pinned[suspicion.row] and len(suspicion.found.problems) == models):
         suspicion = None
     if not any_of(pinned):
+        return _unsuspected(state), evidence
+    skew = state.front.clock_skew
+    if skew is not None and state.core.detector.onsets.age[pinned].min() <= skew.wait:
+        # Readings by clocks that are behind show what the others do not show yet.
         return _unsuspected(state), evidence
     if tick < state.due or not core.alarmed(kernel, evidence):
         return replace(state, suspicion=suspicion), evidence
@@ -491,6 +513,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         inverters = (inverters & ~checks.consistent(front)) | checks.named(front)
     given = verdict.Inputs(
         frame=tick.measured.frame,
+        skew=now.clock_skew,
         seen=seen,
         named=named,
         unread=np.zeros(seen.size, dtype=np.bool_) if tick.unknown is None else tick.unknown.unchecked,

@@ -29,6 +29,7 @@ from gridsec.arrays import PENDING, Bools, Floats, all_of, any_of, deferred, ind
 from gridsec.estimators.detection import AGREEMENT, DecisionInputs, decide
 from gridsec.estimators.front.design import FrontDesign
 from gridsec.estimators.front.device_checks import probability
+from gridsec.estimators.front.measurements import ClockSkew
 from gridsec.estimators.front.output import (
     Finding,
     busbar_deviation,
@@ -406,8 +407,8 @@ class Inputs:
 
     Attributes
     ----------
-    frame
-        The frame.
+    frame, skew
+        The frame, and the changes of the voltages within clock offsets.
     seen, named, unread : (p,)
         Meters with a reading, named ones, and those with a reading that no known power checks.
     jumps, beyond : (p,)
@@ -430,6 +431,7 @@ class Inputs:
     """
 
     frame: Frame
+    skew: ClockSkew | None = field(repr=False)
     seen: Bools
     named: Bools
     unread: Bools
@@ -493,7 +495,7 @@ def verdict(design: FrontDesign, now: Inputs, estimate: Estimate) -> Finding:
     finding = _inverters(design, now, finding)
     if finding[1] in (Cause.AGREEMENT, Cause.SILENT_METERS):
         finding = imprecise(design, now.frame, now.unread & now.seen, estimate) or finding
-    return with_clock_offsets(design, now.frame, tested, finding)
+    return with_clock_offsets(design, now.frame, tested, now.skew, finding)
 
 
 def _busbar(design: FrontDesign, now: Inputs, estimate: Estimate, finding: Finding) -> Finding:
