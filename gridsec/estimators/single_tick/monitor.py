@@ -283,11 +283,16 @@ def _decoded(design: SingleTickDesign, state: SingleTickState, frame: Frame, tru
     limits = Limits(design.options.sigmas, model, front.allowed, front.fixed)
     m = np.where(available, measured.y - v2, 0.0)
     try:
-        answers = design.decoder(DecoderInput(whole, m, available, limits, front.max_attacked))
+        answers = design.decoder(DecoderInput(whole, m, available, limits, _most(front, available)))
     except DesignInfeasible:
         # A solver without a solution is no evidence, neither for nor against a meter.
         answers = ()
     return _Tick(measured, predicted, uncertainty, skew, m, limits, whole, answers)
+
+
+def _most(front: FrontDesign, available: Bools) -> int:
+    """Largest number of accusations among the meters with a reading, (p,)."""
+    return max(1, min(front.max_attacked, int(np.count_nonzero(available)) // 3))
 
 
 def _prior(front: FrontDesign, state: SingleTickState, now: FrameUncertainty) -> Prior:
@@ -428,10 +433,10 @@ def _estimate(design: SingleTickDesign, tick: _Tick, left: _Left) -> Estimate:
         powers=changed(predicted.powers, trusted=~left.suspect),
         injected=predicted.injection_error.error,
         model=predicted.v2_bus[plant.feeder.bus],
-        busbar=metered & ~left.phases,
+        busbar=metered & left.fits & ~left.phases,
         y=measured.y,
         trusted=trusted,
-        # Where the meters disagree, none of them bounds a voltage.
+        # Where the readings disagree, none of them bounds a voltage, that of the busbar included.
         checked=partial(checked, front, measured.frame) if left.fits else partial(np.zeros_like, trusted),
         sigmas=design.options.sigmas,
     )
@@ -475,12 +480,11 @@ def _verdict(
 def _of_meters(design: SingleTickDesign, tick: _Tick, left: _Left, named: Bools, suspect: Bools) -> Finding:
     """Verdict on the meters; named, suspect: (p,)."""
     front, available = design.front, tick.measured.available
-    most = max(1, min(front.max_attacked, int(np.count_nonzero(available)) // 3))
     settled = all_of(tick.predicted.transient <= design.options.settled * left.limit)
     finding = decide(
         DecisionInputs(
             names=front.names,
-            max_attacked=most,
+            max_attacked=_most(front, available),
             live=available,
             suspected=suspect | left.beyond,
             named=named,
