@@ -57,7 +57,6 @@ from gridsec.estimators.front.measurements import (
     unread_powers,
 )
 from gridsec.estimators.front.posterior import EXACT, UNMETERED
-from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.plant import usual
 from gridsec.interface import PowerOrigin
 
@@ -347,7 +346,7 @@ def earlier(design: FrontDesign, before: ClockSkew | None, now: ClockSkew | None
 
 
 def estimated(
-    modes: Modes, given: Unknown, u: Floats, seen: Bools, *, hidden: bool = False
+    noise: Floats, given: Unknown, u: Floats, seen: Bools, *, hidden: bool = False
 ) -> tuple[Floats, Floats]:
     """Mean and variance of the unknown errors at all places, (n,) each, squared pu and squared pu^2.
 
@@ -357,8 +356,10 @@ def estimated(
 
     Parameters
     ----------
-    modes, given
-        The modes, and the unknown directions.
+    noise : (p, p)
+        Covariance of the residuals without the unknown errors, given the means of w and b, squared pu^2.
+    given
+        The unknown directions.
     u : (p,)
         Residuals less the posterior means of w and b.
     seen : (p,)
@@ -366,25 +367,25 @@ def estimated(
     hidden
         No reading narrows the variance of powers and injections.
     """
-    mean, variance = _regressed(modes, given, u, seen)
+    mean, variance = _regressed(noise, given, u, seen)
     if hidden:
         powers, others = given.places[:, : given.powers], given.places.copy()
         others[:, : given.powers] = 0.0
-        other, variance = _regressed(modes, replace(given, places=others), u, seen)
+        other, variance = _regressed(noise, replace(given, places=others), u, seen)
         variance = variance + (powers**2).sum(axis=1) + (mean - other) ** 2
     elif any_of(given.unchecked & seen):
-        other, variance = _regressed(modes, given, u, seen & ~given.unchecked)
+        other, variance = _regressed(noise, given, u, seen & ~given.unchecked)
         variance = variance + (mean - other) ** 2
     return mean, variance
 
 
-def _regressed(modes: Modes, given: Unknown, u: Floats, seen: Bools) -> tuple[Floats, Floats]:
+def _regressed(noise: Floats, given: Unknown, u: Floats, seen: Bools) -> tuple[Floats, Floats]:
     """Regression on the meters `seen` (p,)."""
     n, A = indices(seen), given.meters
     variance = (given.places**2).sum(axis=1)
     if not n.size:
         return np.zeros(variance.size), variance
-    factor = cho_factor(modes.noise[np.ix_(n, n)] + A[n] @ A[n].T)
+    factor = cho_factor(noise[np.ix_(n, n)] + A[n] @ A[n].T)
     cross = A[n] @ given.places.T
     gain = cho_solve(factor, cross)
     return gain.T @ u[n], np.maximum(variance - (gain * cross).sum(axis=0), 0.0)

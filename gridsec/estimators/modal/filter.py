@@ -95,6 +95,12 @@ class Full:
         return np.block([[w, both], [both.T, b]])
 
     @property
+    def whole(self) -> Floats:
+        """Covariance of w + b, (t, t)."""
+        w, both, b = self.blocks
+        return np.asarray(w + both + both.T + b)
+
+    @property
     def variance(self) -> Floats:
         """Variance of w + b, (t,)."""
         w, both, b = (each.diagonal() for each in self.blocks)

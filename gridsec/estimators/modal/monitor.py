@@ -637,7 +637,7 @@ def _estimate(
             u = u - (mean - plain.mean)[front.prior.meters]
             read = read & ~verdict.accused(kernel, state.suspicion)
         hidden = _hidden(state.core, tick.unknown)
-        off, more = doubts.estimated(kernel.modes, tick.unknown, u, read, hidden=hidden)
+        off, more = doubts.estimated(kernel.modes.noise + whole.whole, tick.unknown, u, read, hidden=hidden)
         mean = mean + off
     v2_bus, first = tick.predicted.v2_bus + mean, plant.feeder.busbar_places()
     metered = measured.busbar_metered

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from benchmarks._residuals import Dense, Source, power_columns, tree
 from gridsec.arrays import Floats
@@ -112,7 +113,7 @@ def test_the_estimate_is_the_gaussian_one() -> None:
     places, at = random.standard_normal((13, 2)) * 0.01, MODEL.meters
     given = Unknown(places, places[at], WIDE, np.zeros(12, dtype=np.bool_), 2)
     u, seen = 0.01 * random.standard_normal(12), np.arange(12) != 5
-    mean, variance = doubts.estimated(made, given, u, seen)
+    mean, variance = doubts.estimated(made.noise, given, u, seen)
     whole = np.block(
         [
             [places @ places.T, places @ places[at].T],
@@ -124,11 +125,38 @@ def test_the_estimate_is_the_gaussian_one() -> None:
     assert np.allclose(mean, gain @ u[seen])
     assert np.allclose(variance, np.diag(whole)[:13] - np.diag(gain @ whole[n, :13]), atol=1e-12)
     doubted = Unknown(places, places[at], WIDE, np.arange(12) == 2, 2)
-    same, wider = doubts.estimated(made, doubted, u, seen)
-    other, less = doubts.estimated(made, given, u, seen & (np.arange(12) != 2))
+    same, wider = doubts.estimated(made.noise, doubted, u, seen)
+    other, less = doubts.estimated(made.noise, given, u, seen & (np.arange(12) != 2))
     assert np.allclose(same, mean)
     assert np.allclose(wider, less + (mean - other) ** 2)
     assert (wider >= variance - 1e-15).all()
+
+
+@pytest.mark.parametrize("ticks", [1, 20])
+@pytest.mark.parametrize("lasts", [True, False])
+@pytest.mark.parametrize("columns", [POWER * STEPS[:, [7, 3]], 0.1 * np.ones((12, 1))])
+def test_the_stated_deviation_of_the_estimate_is_seen(columns: Floats, ticks: int, *, lasts: bool) -> None:
+    """Random errors of the model, of the own errors and of the directions: none is stated too small."""
+    made, square = modes(MODEL), []
+    given = Unknown(columns, columns, WIDE[:1], np.zeros(12, dtype=np.bool_), columns.shape[1])
+    for run in range(100):
+        source, random = Source(MODEL, np.random.default_rng(run)), np.random.default_rng([run, 1])
+        state, known, amount = (
+            modal.start(made, 0.0),
+            static.start(made),
+            random.standard_normal(columns.shape[1]),
+        )
+        for k in range(ticks):
+            amount = amount if lasts else random.standard_normal(amount.size)
+            truth = source.w + columns @ amount
+            m = source.tick() + columns @ amount
+            state, known, _ = full.step(made, state, known, float(k), m, None, unknown=given.wide)
+        after = state.full
+        assert after is not None
+        u = m - after.mean[0] - after.mean[1]
+        off, more = doubts.estimated(made.noise + after.whole, given, u, np.ones(12, dtype=np.bool_))
+        square.append((after.mean[0] + off - truth) ** 2 / (after.blocks[0].diagonal() + more))
+    assert 0.4 < np.mean(square) < 1.0
 
 
 def test_behind_unread_powers_readings_narrow_the_busbar_only() -> None:
@@ -137,8 +165,8 @@ def test_behind_unread_powers_readings_narrow_the_busbar_only() -> None:
     power, at = 0.01 * random.standard_normal((13, 1)), MODEL.meters
     places, seen, u = np.hstack([power, np.ones((13, 1))]), np.arange(12) != 5, random.standard_normal(12)
     given = Unknown(places, places[at], WIDE, np.zeros(12, dtype=np.bool_), 1)
-    mean, variance = doubts.estimated(made, given, u, seen, hidden=True)
-    same, _ = doubts.estimated(made, given, u, seen)
+    mean, variance = doubts.estimated(made.noise, given, u, seen, hidden=True)
+    same, _ = doubts.estimated(made.noise, given, u, seen)
     assert np.allclose(mean, same)
     n = at[seen]
     V = places[n] @ places[n].T + made.noise[np.ix_(seen, seen)]
@@ -151,7 +179,7 @@ def test_without_readings_nothing_is_known() -> None:
     """The variance is that of the directions."""
     places = np.ones((13, 1))
     given = Unknown(places, places[MODEL.meters], WIDE[:1], np.zeros(12, dtype=np.bool_), 1)
-    mean, variance = doubts.estimated(modes(MODEL), given, np.ones(12), np.zeros(12, dtype=np.bool_))
+    mean, variance = doubts.estimated(modes(MODEL).noise, given, np.ones(12), np.zeros(12, dtype=np.bool_))
     assert not mean.any()
     assert np.allclose(variance, 1.0)
 
