@@ -210,6 +210,8 @@ def unusable_offsets(design: FrontDesign, offset_s: Floats | None) -> Bools | No
     return far if any_of(far) else None
 
 
+SYNCHRONOUS_S = 0.5
+"""Largest clock offset that is not measured, s; a tick later the reading is that of the others."""
 _MOVED = 0.5
 """Least change of a voltage by a power that counts for itself, in white deviations, 1."""
 
@@ -223,47 +225,65 @@ class ClockSkew:
     negative one it has changes of the next ticks.
     """
 
+    lead: Floats  # (p,) offsets of the clocks, s; 0 where unknown or unusable
     model: Floats  # (k, p) squared voltages of the model, pu
     powers: Floats  # (k, 2 p) active and reactive injections of the metered customers, pu
-    change: Floats  # (p,) largest change to the last tick within a positive lag, squared pu
-    later: Floats  # (k, p) largest changes from these ticks to later ones within a negative lag, squared pu
+    change: Floats  # (p,) largest change to the last tick within the lags, squared pu
+    later: Floats  # (k, p) largest changes from these ticks to later ones within negative lags, squared pu
+    known: Floats  # (k, p) `later` at the last replay, squared pu
+    since: int  # ticks since that
     wait: int  # K of the largest offset: ticks until a step of the busbar is known
+
+    @property
+    def replayed(self) -> ClockSkew:
+        """The same after a replay of the readings with `later`."""
+        return replace(self, known=self.later, since=0)
 
 
 def update_skew(
-    design: FrontDesign, before: ClockSkew | None, offset_s: Floats | None, frame: Frame, v2: Floats
+    design: FrontDesign,
+    before: ClockSkew | None,
+    offset_s: Floats | None,
+    measured: Measurements,
+    v2: Floats,
 ) -> ClockSkew | None:
     """Changes with one more tick; None without a measured offset.
 
-        change_j(t) = max |x_j(t) - x_j(t - k)|,  later_j(t) = max |x_j(t + k) - x_j(t)|,  1 <= k <= K
+        change_j(t) = sum over x of max |x_j(t) - x_j(t - k)|,              1 <= k <= K
+        later_j(t) = max over k of the sum over x of |x_j(t + k) - x_j(t)|
 
-    ``K = ceil(|lag| / step_s) + 1``. x is the contribution of one power with an offset, or that of all else.
-    offset_s: (p,) lead of each clock, s, NaN if not measurable; offsets beyond `largest_offset` count as
-    none. v2: (p,) voltages of the model, squared pu.
+    ``K = ceil(|lag| / step_s) + 1``, and 1 within `SYNCHRONOUS_S`. x is the contribution of one power with an
+    offset, or that of all else. offset_s: (p,) lead of each clock, s, NaN if not measurable; offsets beyond
+    `largest_offset` count as none. v2: (p,) voltages of the model, squared pu.
     """
     lead = np.zeros(v2.size) if offset_s is None else np.nan_to_num(offset_s)
     lead = np.where(np.abs(lead) <= largest_offset(design), lead, 0.0)
     if not any_of(lead):
         return None
-    wait = int(_window(design, lead).max())
-    powers = np.concatenate([frame.p[design.plant.meters], frame.q[design.plant.meters]])
+    wait, at = int(_window(design, lead).max()), design.plant.meters
+    powers = np.concatenate([measured.frame.p[at], measured.q[at]])
+    none = np.zeros((1, v2.size))
     if before is None:
-        none = np.zeros((1, v2.size))
-        return ClockSkew(v2[None], powers[None], none[0], none, wait)
+        return ClockSkew(lead, v2[None], powers[None], none[0], none, none, wait, wait)
     # Row k - 1: changes from k ticks ago.
-    rest, change, later = v2 - before.model[::-1], np.zeros(v2.size), before.later[::-1].copy()
-    moved = powers - before.powers[::-1]
+    rest, moved = v2 - before.model[::-1], powers - before.powers[::-1]
+    change, ahead = np.zeros(v2.size), np.zeros_like(rest)
     for i in _moved(design, moved, lead).tolist():
         of_power = moved[:, [i, v2.size + i]] @ _effect(design, i)
         rest = rest - of_power
-        change, later = _widened(design, change, later, of_power, lead - lead[i])
-    change, later = _widened(design, change, later, rest, lead)
+        change, ahead = _widened(design, (change, ahead), of_power, lead - lead[i])
+    # A clock without a measured offset may be behind by less than is measured.
+    change, ahead = _widened(design, (change, ahead), rest, np.where(lead == 0.0, -SYNCHRONOUS_S, lead))
+    later = np.maximum(before.later, ahead[::-1])
     kept = _window(design, np.array([2.0 * largest_offset(design)]))[0]
     return ClockSkew(
+        lead,
         np.vstack([before.model, v2])[-kept:],
         np.vstack([before.powers, powers])[-kept:],
         change,
-        np.vstack([later[::-1], np.zeros(v2.size)])[-kept:],
+        np.vstack([later, none])[-kept:],
+        np.vstack([before.known, none])[-kept:],
+        before.since + 1,
         wait,
     )
 
@@ -285,22 +305,21 @@ def _effect(design: FrontDesign, meter: int) -> Floats:
 
 def _window(design: FrontDesign, lag: Floats) -> Ints:
     """K of each lag, s; 0 without a lag."""
-    ticks = np.ceil(np.abs(lag) / design.step_s) + 1.0
+    ticks = np.where(np.abs(lag) > SYNCHRONOUS_S, np.ceil(np.abs(lag) / design.step_s) + 1.0, 1.0)
     return np.where(lag != 0.0, ticks, 0.0).astype(np.intp)
 
 
 def _widened(
-    design: FrontDesign, change: Floats, later: Floats, moved: Floats, lag: Floats
+    design: FrontDesign, sums: tuple[Floats, Floats], moved: Floats, lag: Floats
 ) -> tuple[Floats, Floats]:
-    """`change`, and `later` with the newest first, with one source.
+    """Sums of changes to the last tick (p,), and from k ticks ago (k, p) within negative lags, with a source.
 
-    moved, lag: (k, p) changes of the source, the newest first, squared pu, and (p,) lags behind it, s. They
-    stand for those of the next ticks as well.
+    moved, lag: (k, p) changes of the source, the newest first, squared pu, and (p,) lags behind it, s. The
+    changes of the last ticks stand for those of the next ones as well.
     """
     ago, window = np.arange(1, len(moved) + 1)[:, None], _window(design, lag)
     size = np.where(ago <= window, np.abs(moved), 0.0)
-    later = np.maximum(later, np.where(lag < 0.0, size, 0.0))
-    return np.maximum(change, size.max(axis=0, initial=0.0)), later
+    return sums[0] + size.max(axis=0, initial=0.0), sums[1] + np.where(lag < 0.0, size, 0.0)
 
 
 # --- Busbar readings ---

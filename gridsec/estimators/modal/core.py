@@ -383,12 +383,26 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
         return seen if k < first else ~named if seen is None else seen & ~named, unknown
 
     now, evidence = again(core, state, first, masked, begun)
-    found, amount = suspicion.found, np.zeros(core.effect.shape[1])
+    amount = amounts(core, state, suspicion)[: named.size]
+    return replace(now, masked=masking.added(state.masked, named, amount)), evidence
+
+
+def amounts(core: Core, state: CoreState, suspicion: Suspicion) -> Floats:
+    """Amounts of the faults of the best explanation, (q,).
+
+    Parameters
+    ----------
+    core, state
+        The core, and the state after a tick.
+    suspicion
+        The explanations after the same tick.
+    """
+    found, out = suspicion.found, np.zeros(core.effect.shape[1])
     model, chosen = int(found.model[0]), found.chosen[0]
     # The amounts of a ramp are those of its unit of time.
     joint = _joint_under(core, state, suspicion.row, model)
-    amount[chosen] = joint.level * mean_amounts(found.problems[model], chosen)
-    return replace(now, masked=masking.added(state.masked, named, amount[: named.size])), evidence
+    out[chosen] = joint.level * mean_amounts(found.problems[model], chosen)
+    return out
 
 
 Change = Callable[[int, Bools | None, Floats | None], tuple[Bools | None, Floats | None]]

@@ -46,6 +46,7 @@ from gridsec.estimators.front.device_checks import (
     track_busbar,
 )
 from gridsec.estimators.front.measurements import (
+    SYNCHRONOUS_S,
     Measurements,
     checked,
     measurements,
@@ -92,6 +93,8 @@ SETTLING = 32
 """Largest number of ticks at the start of a run that the core gives up for complete readings."""
 HELD = 8
 """Readings from a jump on for which the verdict is open: log M is evaluated twice in them."""
+TAP = 0.05
+"""Largest step of a tap changer, squared pu: 2.5 % of the voltage."""
 PAUSE = 60.0
 """Ticks without a frame that count as a pause for the time of commissioning."""
 
@@ -280,7 +283,10 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     v2 = predicted.v2_bus[front.prior.meters]
     skew = given.clock_skew
     if skew is not None or frame.clock_offset is not None:
-        skew = update_skew(front, skew, frame.clock_offset, measured.frame, v2)
+        skew = update_skew(front, skew, frame.clock_offset, measured, v2)
+    moved = doubts.earlier(front, skew)
+    if skew is not None and moved is not None:
+        state, skew = _moved_later(design, state, moved), skew.replayed
     kinds = ingest(front.references, given.attack_kinds, measured.y, measured.available)
     now = changed(
         given,
@@ -296,7 +302,6 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     m = measured.y - drive.expected(v2, state.fit.own)
     if not whole:
         m = np.where(seen, m, 0.0)
-    state = _moved_later(design, state, doubts.earlier(front, given.clock_skew, skew))
     kernel = _begun_anew(design, state, frame.t) if open_ is None and whole else state.core
     kernel, evidence = core.step(
         design.core,
@@ -345,11 +350,11 @@ def _repeating(state: CoreState, which: Bools) -> CoreState:
     return replace(state, masked=masking.added(state.masked, which)) if any_of(which) else state
 
 
-def _moved_later(design: ModalDesign, state: ModalState, moved: Floats | None) -> ModalState:
-    """State after the last readings, with the standard deviations (k, p) that these gain; None: none."""
+def _moved_later(design: ModalDesign, state: ModalState, moved: Floats) -> ModalState:
+    """State after the last readings, with the standard deviations (k, p) that these gain."""
     kernel = state.core
     count = len(kernel.history.readings)
-    if moved is None or not count:
+    if not count:
         return state
 
     def wider(k: int, seen: Bools | None, unknown: Floats | None) -> tuple[Bools | None, Floats | None]:
@@ -375,10 +380,6 @@ def _identified(
     if suspicion is not None and not (pinned[suspicion.row] and len(suspicion.found.problems) == models):
         suspicion = None
     if not any_of(pinned):
-        return _unsuspected(state), evidence
-    skew = state.front.clock_skew
-    if skew is not None and state.core.detector.onsets.age[pinned].min() <= skew.wait:
-        # Readings by clocks that are behind show what the others do not show yet.
         return _unsuspected(state), evidence
     if tick < state.due or not core.alarmed(kernel, evidence):
         return replace(state, suspicion=suspicion), evidence
@@ -413,6 +414,9 @@ def _named(
     if suspicion.fits and not any_of(sure):
         # Masked meters alone may have been manipulated before they were masked.
         sure = alone(suspicion.found, masked)
+    if _early(design, after, suspicion):
+        # Readings by clocks that are behind may show what the others do not show yet.
+        return after, evidence
     if any_of(sure):
         found = replace(suspicion.found, named=sure)
         now, evidence = core.mask(kernel, state.core, replace(suspicion, found=found))
@@ -426,6 +430,26 @@ def _named(
         if adopted is not state.core:
             return replace(after, core=adopted, suspicion=None), evidence
     return after, evidence
+
+
+def _early(design: ModalDesign, state: ModalState, suspicion: Suspicion) -> bool:
+    """Steps that other clocks do not show yet may explain a false reading of the best explanation.
+
+    The suspicion is younger than the largest clock offset. Loads of the size of their connections, or a step
+    of the tap changer, move the voltage by more than the reading is off.
+    """
+    skew, kernel, at = state.front.clock_skew, design.core, design.plant.meters
+    if skew is None or state.core.spell > skew.wait:
+        return False
+    off = np.abs(core.amounts(kernel, state.core, suspicion)[: at.size])
+    powers = at.size + at
+    most = kernel.bound[powers] / core.MOST_POWER
+    power = np.abs(kernel.effect[design.front.prior.meters][:, powers]) * most
+    # Clocks without a measured offset differ by less than a tick: one load at a time.
+    ahead = np.minimum(skew.lead, 0.0)[:, None] + SYNCHRONOUS_S < skew.lead
+    step = np.where(ahead, power, 0.0).sum(axis=1)
+    step = np.where(skew.lead < SYNCHRONOUS_S, np.maximum(step, np.maximum(power.max(axis=1), TAP)), step)
+    return not any_of(off > step) or any_of((off > 0.0) & (off <= step))
 
 
 def _searched(

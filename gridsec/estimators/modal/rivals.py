@@ -64,6 +64,8 @@ APART = 0.05
 """Standard deviation of a reading within a transition, squared pu: manipulations of several percent."""
 RATE = 1.0 / 60.0
 """Prior probability of a jump of each size, per tick: kettles and cars of a street."""
+FORGOTTEN = 1e-9
+"""Least share of the loads' variance that a pause leaves, 1: of a jump within a longer one less is left."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -376,7 +378,7 @@ def _jumped(modes: Modes, state: FilterState, gap: Interval, size: float) -> Fil
     """State before a tick at which the loads jump."""
     if not size:
         return state
-    more = size / gap.decay(modes)[0] ** 2
+    more = size / max(gap.decay(modes)[0] ** 2, FORGOTTEN)
     cov, full = state.cov.copy(), state.full
     cov[0] += more * modes.loads
     if full is not None:

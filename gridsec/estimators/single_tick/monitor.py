@@ -275,7 +275,7 @@ def _decoded(design: SingleTickDesign, state: SingleTickState, frame: Frame, tru
     predicted = predict(front, _trusting(given, trusted), measured, uncertainty.sizes)
     v2, noise, skew = predicted.v2_bus[front.prior.meters], design.noise, given.clock_skew
     if skew is not None or frame.clock_offset is not None:
-        skew = update_skew(front, skew, frame.clock_offset, measured.frame, v2)
+        skew = update_skew(front, skew, frame.clock_offset, measured, v2)
     if skew is not None:
         noise = noise + skew.change**2
     whole = _posterior(state.whole, _prior(front, state, uncertainty), noise, available)

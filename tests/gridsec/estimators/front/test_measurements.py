@@ -11,11 +11,14 @@ from benchmarks.clock_offsets import TAP_PU, run
 from benchmarks.late_powers import site, watcher, world
 from feeders.model.site import Snapshot, to_frame
 from feeders.simulation.scenario import START
+from gridsec.arrays import Floats
 from gridsec.estimators.detection import AGREEMENT
 from gridsec.estimators.front.measurements import (
+    SYNCHRONOUS_S,
     frame_prior,
     frame_variance,
     largest_offset,
+    measurements,
     nominal_uncertainty,
     unusable_offsets,
     update_skew,
@@ -39,35 +42,38 @@ def test_changes_are_those_of_the_definition() -> None:
     # The last but three is the largest usable offset; the next is beyond that.
     offset = np.array([0.5, -0.9, 2.0, -3.0, most, most + 0.1, np.nan, 0.0])
     lead = np.where(np.abs(np.nan_to_num(offset)) <= most, np.nan_to_num(offset), 0.0)
-    model, one, skew = made.plant.feeder.linear(), Street(made.plant, rng).frame(), None
+    model, frame, skew = made.plant.feeder.linear(), Street(made.plant, rng).frame(), None
+    measured = measurements(made, frame, frame.seen, np.ones(1, dtype=np.bool_), 1.0)
     R, X = (2.0 * each[made.plant.feeder.bus][made.plant.meters] for each in (model.R_bus, model.X_bus))
     # Powers that move by much at every tick, so that each with an offset is a source.
-    p, q = (
-        0.3 * rng.choice([-1.0, 1.0], (2, ticks, one.p.size)) * rng.uniform(1.0, 2.0, (2, ticks, one.p.size))
-    )
+    sign = rng.choice([-1.0, 1.0], (2, ticks, frame.p.size))
+    p, q = 0.3 * sign * rng.uniform(1.0, 2.0, sign.shape)
     of_power = [p[:, [c]] * R[:, c] + q[:, [c]] * X[:, c] for c in made.plant.meters]
     rest = 1.0 + 0.01 * rng.standard_normal((ticks, P))
     sources = [(of_power[i], lead - lead[i]) for i in np.flatnonzero(lead)]
-    sources.append((rest + sum(of_power[i] for i in np.flatnonzero(lead == 0.0)), lead))
+    others = rest + sum(of_power[i] for i in np.flatnonzero(lead == 0.0))
+    sources.append((others, np.where(lead == 0.0, -SYNCHRONOUS_S, lead)))
+
+    def window(lag: float) -> int:
+        return 0 if lag == 0.0 else 1 if abs(lag) <= SYNCHRONOUS_S else int(np.ceil(abs(lag))) + 1
+
+    def later(x: Floats, lag: float, t: int, j: int, k: int) -> float:
+        return abs(x[t + k, j] - x[t, j]) if lag < 0.0 and k <= window(lag) else 0.0
+
     for t in range(ticks):
         v2 = rest[t] + sum(each[t] for each in of_power)
-        skew = update_skew(made, skew, offset, replace(one, p=p[t], q=q[t]), v2)
+        now = replace(measured, frame=replace(frame, p=p[t]), q=q[t])
+        skew = update_skew(made, skew, offset, now, v2)
         assert skew is not None
-        change, later = np.zeros(P), np.zeros(P)
         back = min(t, 4)  # readings from before the last tick
-        for x, lag in sources:
-            for j in range(P):
-                most_k = int(np.ceil(abs(lag[j]))) + 1 if lag[j] else 0
-                change[j] = max(
-                    [change[j], *(abs(x[t, j] - x[t - k, j]) for k in range(1, min(most_k, t) + 1))]
-                )
-                if lag[j] < 0.0:
-                    after = (
-                        abs(x[t - back + k, j] - x[t - back, j]) for k in range(1, min(most_k, back) + 1)
-                    )
-                    later[j] = max([later[j], *after])
-        np.testing.assert_allclose(skew.change, change, rtol=1e-6, atol=1e-12)
-        np.testing.assert_allclose(skew.later[-1 - back], later, rtol=1e-6, atol=1e-12)
+        for j in range(P):
+            change = sum(
+                max((abs(x[t, j] - x[t - k, j]) for k in range(1, min(window(lag[j]), t) + 1)), default=0.0)
+                for x, lag in sources
+            )
+            ahead = (sum(later(x, lag[j], t - back, j, k) for x, lag in sources) for k in range(1, back + 1))
+            assert skew.change[j] == pytest.approx(change, rel=1e-6, abs=1e-12)
+            assert skew.later[-1 - back, j] == pytest.approx(max(ahead, default=0.0), rel=1e-6, abs=1e-12)
         assert skew.wait == 16
     assert unusable_offsets(made, offset).tolist() == [k == 5 for k in range(P)]
     assert largest_offset(made) == most
@@ -78,9 +84,10 @@ def test_changes_are_those_of_the_definition() -> None:
 def test_without_a_measured_offset_nothing_is_kept(offset: np.ndarray | None) -> None:
     made = front_end(make_plant(np.random.default_rng(1), customers=P, drop=0.02))
     frame = Street(made.plant, np.random.default_rng(2)).frame()
-    kept = update_skew(made, None, np.full(P, 1.0), frame, np.ones(P))
+    now = measurements(made, frame, frame.seen, np.ones(1, dtype=np.bool_), 1.0)
+    kept = update_skew(made, None, np.full(P, 1.0), now, np.ones(P))
     assert kept is not None
-    assert update_skew(made, kept, offset, frame, np.ones(P)) is None
+    assert update_skew(made, kept, offset, now, np.ones(P)) is None
 
 
 def test_all_clocks_off_and_a_still_feeder_is_clean_and_liars_are_named() -> None:
@@ -258,7 +265,8 @@ def test_a_meter_that_alternates_behind_a_clock_offset_is_not_clean(size: float)
 def test_changes_beyond_the_class_within_clock_offsets_are_not_clean() -> None:
     plant = make_plant(np.random.default_rng(3), customers=P, drop=0.02)
     made, frame = front_end(plant), Street(plant, np.random.default_rng(4)).frame()
-    skew = update_skew(made, None, np.where(np.arange(P) == 2, 1.0, np.nan), frame, np.ones(P))
+    now = measurements(made, frame, frame.seen, np.ones(1, dtype=np.bool_), 1.0)
+    skew = update_skew(made, None, np.where(np.arange(P) == 2, 1.0, np.nan), now, np.ones(P))
     assert skew is not None
     within, seen = made.allowed * np.where(np.arange(P) % 3 == 2, 1.01, 0.99), np.arange(P) != 5
     decision, cause, sentence = with_clock_offsets(made, frame, seen, replace(skew, change=within), AGREEMENT)
