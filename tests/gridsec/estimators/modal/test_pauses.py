@@ -10,6 +10,7 @@ import pytest
 from feeders.model.site import load
 from feeders.registry import design
 from feeders.simulation.trial import Trial, TrialMeterErrors, frames
+from gridsec.estimators.modal import monitor
 from gridsec.interface import Decision, Frame
 from tests.gridsec.estimators.modal.streets import prepare, watch
 from tests.gridsec.street import BASE_KVA, Street, make_plant
@@ -74,3 +75,20 @@ def test_who_fell_silent_does_not_stand_for_others() -> None:
     last = answers[-1][1]
     assert np.flatnonzero(last.suspects).tolist() == [1, 4, 8, 11]
     assert last.decision is Decision.ATTACKED
+
+
+def test_days_without_a_frame_beside_an_open_suspicion() -> None:
+    """The loads have forgotten all of their errors, and jump at the first frame."""
+    plant = make_plant(np.random.default_rng(3), customers=12, drop=0.04, inverters=np.arange(0))
+    made, street = prepare(plant), Street(plant, np.random.default_rng(4), wobble=0.01)
+    state, lies = monitor.init(made, street.t - 1.0), {3: 0.03, 5: -0.03, 7: 0.03, 9: -0.03, 1: 0.03}
+    for k in range(100):
+        street.advance(1.0)
+        frame = street.frame(lies if k > 60 else None)
+        if k == 99:
+            names = ("p", "p_error", "q", "q_error")
+            frame = replace(frame, t=frame.t + 3.0 * 86_400.0, **{n: 4.0 * getattr(frame, n) for n in names})
+        state, _, verdict = monitor.step(made, state, frame)
+        if k == 98:
+            assert state.core.rivals
+    assert verdict.decision is not Decision.CLEAN
