@@ -212,6 +212,8 @@ def unusable_offsets(design: FrontDesign, offset_s: Floats | None) -> Bools | No
 
 SYNCHRONOUS_S = 0.5
 """Largest clock offset that is not measured, s; a tick later the reading is that of the others."""
+_SHORT_S = 10.0
+"""Longest tick of which `SYNCHRONOUS_S` is a part that counts, s."""
 _MOVED = 0.5
 """Least change of a voltage by a power that counts for itself, in white deviations, 1."""
 
@@ -246,20 +248,25 @@ def update_skew(
     offset_s: Floats | None,
     measured: Measurements,
     v2: Floats,
+    *,
+    last: Floats | None = None,
 ) -> ClockSkew | None:
-    """Changes with one more tick; None without a measured offset.
+    """Changes with one more tick; None without a measured offset or a sudden change.
 
         change_j(t) = sum over x of max |x_j(t) - x_j(t - k)|,              1 <= k <= K
         later_j(t) = max over k of the sum over x of |x_j(t + k) - x_j(t)|
 
     ``K = ceil(|lag| / step_s) + 1``, and 1 within `SYNCHRONOUS_S`. x is the contribution of one power with an
     offset, or that of all else. offset_s: (p,) lead of each clock, s, NaN if not measurable; offsets beyond
-    `largest_offset` count as none. v2: (p,) voltages of the model, squared pu.
+    `largest_offset` count as none. v2, last: (p,) voltages of the model, and those of the tick before with
+    powers known alike, squared pu; None: not comparable.
     """
     lead = np.zeros(v2.size) if offset_s is None else np.nan_to_num(offset_s)
     lead = np.where(np.abs(lead) <= largest_offset(design), lead, 0.0)
     if not any_of(lead):
-        return None
+        return _sudden(design, last, v2)
+    if before is not None and not any_of(before.lead):
+        before = None
     wait, at = int(_window(design, lead).max()), design.plant.meters
     powers = np.concatenate([measured.frame.p[at], measured.q[at]])
     none = np.zeros((1, v2.size))
@@ -285,6 +292,19 @@ def update_skew(
         np.vstack([before.known, none])[-kept:],
         before.since + 1,
         wait,
+    )
+
+
+def _sudden(design: FrontDesign, last: Floats | None, v2: Floats) -> ClockSkew | None:
+    """Changes within a tick beyond the accuracy class: clocks within `SYNCHRONOUS_S` show them apart."""
+    if last is None or design.step_s > _SHORT_S:
+        return None
+    change = np.abs(v2 - last)
+    if not any_of(change > design.allowed):
+        return None
+    none = np.zeros((2, v2.size))
+    return ClockSkew(
+        none[0], np.stack([last, v2]), np.tile(none, 2), change, np.stack([change, none[0]]), none, 1, 1
     )
 
 
@@ -402,6 +422,11 @@ class FrameUncertainty:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "usual", all_of(self.p <= 1.0) and all_of(self.q <= 1.0))
+
+    def knows_as(self, other: FrameUncertainty) -> bool:
+        """Powers and busbar are known as in another frame."""
+        pairs = (self.p, other.p), (self.q, other.q), (self.busbar, other.busbar), (self.read, other.read)
+        return all(one is another for one, another in pairs)
 
 
 def nominal_uncertainty(design: FrontDesign) -> FrameUncertainty:

@@ -102,9 +102,7 @@ def clock_sentence(names: tuple[str, ...], which: Bools, limit_s: float) -> str:
 def moved_sentence(names: tuple[str, ...], which: Bools) -> str:
     """Meters `which` (p,) with a voltage that changes within the clock offsets."""
     found = _list([name for name, one in zip(names, which, strict=True) if one])
-    return (
-        f"The voltage of {found} changes within the measured clock offsets by more than the accuracy class."
-    )
+    return f"The voltage of {found} changes within the clock offsets by more than the accuracy class."
 
 
 _SHOWN = 5

@@ -114,7 +114,8 @@ class FrontState:
     busbar: BusbarTrust  # trust of the busbar's meter
     trust: TrustState  # trust of the meters
     uncertainty: FrameUncertainty  # uncertainty of the frames
-    clock_skew: ClockSkew | None  # voltage changes within clock offsets; None while no offset is measured
+    model: Floats | None  # (p,) squared voltages of the model at the meters, pu; None before the first frame
+    clock_skew: ClockSkew | None  # voltage changes within clock offsets; None while none counts
     busbar_history: (
         BusbarHistory | None
     )  # readings for the busbar's clock offset; None while it is not measured
@@ -152,6 +153,7 @@ def init(
         busbar=trusted_busbar(design.busbar_incidence.shape[1]),
         trust=TrustState.initial(p),
         uncertainty=nominal_uncertainty(design),
+        model=None,
         clock_skew=None,
         busbar_history=None,
         learning=known.learning,

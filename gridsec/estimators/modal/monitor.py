@@ -281,9 +281,9 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
         jumps = trusted & ~given.trust.trusted
         held = np.where(jumps, HELD, np.maximum(held - measured.available, 0))
     v2 = predicted.v2_bus[front.prior.meters]
-    skew = given.clock_skew
-    if skew is not None or frame.clock_offset is not None:
-        skew = update_skew(front, skew, frame.clock_offset, measured, v2)
+    # A power that comes back is no step of the voltage.
+    last = given.model if uncertainty.knows_as(state.front.uncertainty) else None
+    skew = update_skew(front, given.clock_skew, frame.clock_offset, measured, v2, last=last)
     moved = doubts.earlier(front, skew)
     if skew is not None and moved is not None:
         state, skew = _moved_later(design, state, moved), skew.replayed
@@ -291,6 +291,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     now = changed(
         given,
         uncertainty=uncertainty,
+        model=v2,
         clock_skew=skew,
         busbar_history=history,
         attack_kinds=kinds,

@@ -298,8 +298,9 @@ def _most(front: FrontDesign, available: Bools) -> int:
 def _prior(front: FrontDesign, state: SingleTickState, now: FrameUncertainty) -> Prior:
     """Prior of the frame: that of the last one where its powers and busbar are known alike."""
     before = state.front.uncertainty
-    same = now.p is before.p and now.q is before.q and now.busbar is before.busbar and now.read is before.read
-    return state.whole.prior if same and state.whole is not None else frame_prior(front, now)
+    if state.whole is not None and now.knows_as(before):
+        return state.whole.prior
+    return frame_prior(front, now)
 
 
 def _posterior(before: Posterior | None, prior: Prior, noise: Floats, trusted: Bools) -> Posterior:

@@ -92,7 +92,8 @@ def test_errors_of_registers_follow_the_voltage() -> None:
         street.v0 = 1.0 if k < 400 else 0.95
         state, _, verdict = step(made, state, street.frame())
         largest = max(largest, state.core.detector.log_m)
-        assert verdict.decision is Decision.CLEAN or k < 10
+        # At the step itself a reading may be of the moment before.
+        assert verdict.decision is Decision.CLEAN or k < 10 or k == 400
     assert largest < 0.6 * made.core.limit
     off = own_errors(made, state.core) - 2.0 * street.bias
     # All meters share the error of the busbar's.
