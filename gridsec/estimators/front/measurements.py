@@ -212,6 +212,8 @@ def unusable_offsets(design: FrontDesign, offset_s: Floats | None) -> Bools | No
 
 SYNCHRONOUS_S = 0.5
 """Largest clock offset that is not measured, s; a tick later the reading is that of the others."""
+_RESTS = 4
+"""Least number of ticks from one replay of readings to the next."""
 _SHORT_S = 10.0
 """Longest tick of which `SYNCHRONOUS_S` is a part that counts, s."""
 _MOVED = 0.5
@@ -235,6 +237,11 @@ class ClockSkew:
     known: Floats  # (k, p) `later` at the last replay, squared pu
     since: int  # ticks since that
     wait: int  # K of the largest offset: ticks until a step of the busbar is known
+
+    @property
+    def due(self) -> bool:
+        """A replay is due, once in `wait` or `_RESTS` ticks, which bounds its time."""
+        return self.since >= max(self.wait, _RESTS)
 
     @property
     def replayed(self) -> ClockSkew:
@@ -264,14 +271,14 @@ def update_skew(
     lead = np.zeros(v2.size) if offset_s is None else np.nan_to_num(offset_s)
     lead = np.where(np.abs(lead) <= largest_offset(design), lead, 0.0)
     if not any_of(lead):
-        return _sudden(design, last, v2)
+        return _sudden(design, before, v2, last)
     if before is not None and not any_of(before.lead):
         before = None
     wait, at = int(_window(design, lead).max()), design.plant.meters
     powers = np.concatenate([measured.frame.p[at], measured.q[at]])
     none = np.zeros((1, v2.size))
     if before is None:
-        return ClockSkew(lead, v2[None], powers[None], none[0], none, none, wait, wait)
+        return ClockSkew(lead, v2[None], powers[None], none[0], none, none, max(wait, _RESTS), wait)
     # Row k - 1: changes from k ticks ago.
     rest, moved = v2 - before.model[::-1], powers - before.powers[::-1]
     change, ahead = np.zeros(v2.size), np.zeros_like(rest)
@@ -295,16 +302,19 @@ def update_skew(
     )
 
 
-def _sudden(design: FrontDesign, last: Floats | None, v2: Floats) -> ClockSkew | None:
+def _sudden(
+    design: FrontDesign, before: ClockSkew | None, v2: Floats, last: Floats | None
+) -> ClockSkew | None:
     """Changes within a tick beyond the accuracy class: clocks within `SYNCHRONOUS_S` show them apart."""
-    if last is None or design.step_s > _SHORT_S:
+    since, none = _RESTS if before is None else before.since + 1, np.zeros((2, v2.size))
+    change, last = none[0], v2 if last is None or design.step_s > _SHORT_S else last
+    moved = np.abs(v2 - last)
+    if any_of(moved > design.allowed):
+        change = moved
+    elif since >= _RESTS:
         return None
-    change = np.abs(v2 - last)
-    if not any_of(change > design.allowed):
-        return None
-    none = np.zeros((2, v2.size))
     return ClockSkew(
-        none[0], np.stack([last, v2]), np.tile(none, 2), change, np.stack([change, none[0]]), none, 1, 1
+        none[0], np.stack([last, v2]), np.tile(none, 2), change, np.stack([change, none[0]]), none, since, 1
     )
 
 

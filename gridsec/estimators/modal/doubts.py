@@ -335,14 +335,14 @@ def earlier(design: FrontDesign, skew: ClockSkew | None) -> Floats | None:
     design
         The front end.
     skew
-        Changes of the voltages. A replay is due once in `wait` ticks, which bounds its time.
+        Changes of the voltages.
 
     Returns
     -------
     (k, p)
         Standard deviations that the readings before the last one gain, the newest last, squared pu.
     """
-    if skew is None or skew.since < skew.wait:
+    if skew is None or not skew.due:
         return None
     later, known = skew.later[:-1], skew.known[:-1]
     new: Bools = np.asarray((later > LATER * np.sqrt(design.white)) & (later > GROWN * known))

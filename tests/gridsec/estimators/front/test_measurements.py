@@ -100,6 +100,11 @@ def test_a_step_beyond_the_class_may_be_a_tick_apart_without_an_offset() -> None
     assert skew is not None
     np.testing.assert_allclose(skew.change, step, rtol=1e-9)
     np.testing.assert_allclose(skew.later, [step, 0.0 * step], rtol=1e-9)
+    # Until the next replay may be due, its age is kept.
+    for age in (1, 2, 3):
+        skew = update_skew(made, skew.replayed if age == 1 else skew, None, now, 1.0 + step, last=1.0 + step)
+        assert skew is not None
+        assert (skew.since, skew.due, float(skew.change.max())) == (age, False, 0.0)
     assert update_skew(made, skew, None, now, 1.0 + step, last=1.0 + step) is None
     assert update_skew(made, None, None, now, 1.0 + 0.9 * step, last=np.ones(P)) is None
     assert update_skew(replace(made, step_s=60.0), None, None, now, 1.0 + step, last=np.ones(P)) is None
