@@ -220,6 +220,12 @@ _MOVED = 0.5
 """Least change of a voltage by a power that counts for itself, in white deviations, 1."""
 
 
+_FOLLOWED = 0.25
+"""Least share of a sudden change of the model that the readings show at the same tick, 1."""
+LastTick = tuple[Floats, Frame]
+"""Voltages of the model at the meters (p,), squared pu, and the frame of a tick."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ClockSkew:
     """Changes of the voltages within the clock offsets. k ticks, the newest last, p meters.
@@ -244,6 +250,11 @@ class ClockSkew:
         return self.since >= max(self.wait, _RESTS)
 
     @property
+    def single(self) -> bool:
+        """A sudden change without a measured offset, and none in the last `_RESTS` ticks."""
+        return self.since == 0 and not any_of(self.lead)
+
+    @property
     def replayed(self) -> ClockSkew:
         """The same after a replay of the readings with `later`."""
         return replace(self, known=self.later, since=0)
@@ -256,7 +267,7 @@ def update_skew(
     measured: Measurements,
     v2: Floats,
     *,
-    last: Floats | None = None,
+    last: LastTick | None = None,
 ) -> ClockSkew | None:
     """Changes with one more tick; None without a measured offset or a sudden change.
 
@@ -265,13 +276,15 @@ def update_skew(
 
     ``K = ceil(|lag| / step_s) + 1``, and 1 within `SYNCHRONOUS_S`. x is the contribution of one power with an
     offset, or that of all else. offset_s: (p,) lead of each clock, s, NaN if not measurable; offsets beyond
-    `largest_offset` count as none. v2, last: (p,) voltages of the model, and those of the tick before with
-    powers known alike, squared pu; None: not comparable.
+    `largest_offset` count as none. v2: (p,) voltages of the model, squared pu. last: those of the tick before
+    with powers known alike, and its frame; None: not comparable.
     """
-    lead = np.zeros(v2.size) if offset_s is None else np.nan_to_num(offset_s)
+    if offset_s is None:
+        return _sudden(design, before, measured, v2, last)
+    lead = np.nan_to_num(offset_s)
     lead = np.where(np.abs(lead) <= largest_offset(design), lead, 0.0)
     if not any_of(lead):
-        return _sudden(design, before, v2, last)
+        return _sudden(design, before, measured, v2, last)
     if before is not None and not any_of(before.lead):
         before = None
     wait, at = int(_window(design, lead).max()), design.plant.meters
@@ -303,18 +316,24 @@ def update_skew(
 
 
 def _sudden(
-    design: FrontDesign, before: ClockSkew | None, v2: Floats, last: Floats | None
+    design: FrontDesign, before: ClockSkew | None, measured: Measurements, v2: Floats, last: LastTick | None
 ) -> ClockSkew | None:
-    """Changes within a tick beyond the accuracy class: clocks within `SYNCHRONOUS_S` show them apart."""
-    since, none = _RESTS if before is None else before.since + 1, np.zeros((2, v2.size))
-    change, last = none[0], v2 if last is None or design.step_s > _SHORT_S else last
-    moved = np.abs(v2 - last)
-    if any_of(moved > design.allowed):
-        change = moved
-    elif since >= _RESTS:
+    """Changes within a tick beyond the accuracy class: clocks within `SYNCHRONOUS_S` show them apart.
+
+    The readings follow the model, ``sum dy dv >= _FOLLOWED sum dv^2``: a false busbar or power moves none.
+    """
+    since, change = _RESTS if before is None else before.since + 1, np.zeros(v2.size)
+    if last is not None and design.step_s <= _SHORT_S:
+        moved = v2 - last[0]
+        if any_of(np.abs(moved) > design.allowed):
+            both = measured.available & last[1].seen
+            dv, dy = moved[both], (measured.y - last[1].y)[both]
+            change = np.abs(moved) if dy @ dv >= _FOLLOWED * (dv @ dv) else change
+    if since >= _RESTS and not any_of(change):
         return None
+    none, rows = np.zeros((2, v2.size)), v2 if last is None else last[0]
     return ClockSkew(
-        none[0], np.stack([last, v2]), np.tile(none, 2), change, np.stack([change, none[0]]), none, since, 1
+        none[0], np.stack([rows, v2]), np.tile(none, 2), change, np.stack([change, none[0]]), none, since, 1
     )
 
 

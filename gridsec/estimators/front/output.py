@@ -187,10 +187,11 @@ def with_clock_offsets(
     """The finding with the meters that clock offsets keep from a comparison.
 
     Meters with an unusable offset count as silent, and are in the sentence. A change within usable offsets by
-    more than the accuracy class is UNDECIDED in place of CLEAN. available: (p,) meters with a reading.
+    more than the accuracy class is UNDECIDED in place of CLEAN, a single sudden one excepted. available: (p,)
+    meters with a reading.
     """
     decision, cause, reason = finding
-    if decision is Decision.CLEAN and skew is not None:
+    if decision is Decision.CLEAN and skew is not None and not skew.single:
         moved = available & (skew.change > design.allowed)
         if not any_of(moved):
             return finding

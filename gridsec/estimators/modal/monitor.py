@@ -281,8 +281,10 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
         jumps = trusted & ~given.trust.trusted
         held = np.where(jumps, HELD, np.maximum(held - measured.available, 0))
     v2 = predicted.v2_bus[front.prior.meters]
+    last = None
     # A power that comes back is no step of the voltage.
-    last = given.model if uncertainty.knows_as(state.front.uncertainty) else None
+    if given.model is not None and given.frame is not None and uncertainty.knows_as(state.front.uncertainty):
+        last = given.model, given.frame
     skew = update_skew(front, given.clock_skew, frame.clock_offset, measured, v2, last=last)
     moved = doubts.earlier(front, skew)
     if skew is not None and moved is not None:

@@ -278,7 +278,8 @@ def test_meters_that_fall_silent_are_forecast() -> None:
                 assert not verdict.suspects.any()
             errors.append((estimate.v2 - (sample.v_volt / site.customer_volt) ** 2)[some])
         off.append(errors)
-    assert rms(off[1]) < 0.8 * rms(off[0])
+    # The other meters tell most of it, with the errors of their own.
+    assert rms(off[1]) < min(rms(off[0]), 0.01)
 
 
 def test_a_told_deviation_is_believed_although_the_interval_is_wide() -> None:

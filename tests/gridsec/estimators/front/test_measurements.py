@@ -15,6 +15,7 @@ from gridsec.arrays import Floats
 from gridsec.estimators.detection import AGREEMENT
 from gridsec.estimators.front.measurements import (
     SYNCHRONOUS_S,
+    Measurements,
     frame_prior,
     frame_variance,
     largest_offset,
@@ -87,27 +88,37 @@ def test_without_a_measured_offset_nothing_is_kept(offset: np.ndarray | None) ->
     now = measurements(made, frame, frame.seen, np.ones(1, dtype=np.bool_), 1.0)
     kept = update_skew(made, None, np.full(P, 1.0), now, np.ones(P))
     assert kept is not None
-    assert update_skew(made, kept, offset, now, np.ones(P), last=np.ones(P)) is None
+    assert update_skew(made, kept, offset, now, np.ones(P), last=(np.ones(P), frame)) is None
 
 
 def test_a_step_beyond_the_class_may_be_a_tick_apart_without_an_offset() -> None:
     """Unknown by its size at its tick and at the one before; nothing of it is kept. Not over long ticks."""
     made = front_end(make_plant(np.random.default_rng(1), customers=P, drop=0.02))
-    frame = Street(made.plant, np.random.default_rng(2)).frame()
-    now = measurements(made, frame, frame.seen, np.ones(1, dtype=np.bool_), 1.0)
+    frame, v2 = Street(made.plant, np.random.default_rng(2)).frame(), np.ones(P)
     step = made.allowed * np.where(np.arange(P) == 3, 1.01, 0.5)
-    skew = update_skew(made, None, None, now, 1.0 + step, last=np.ones(P))
+
+    def of(moved: Floats) -> Measurements:
+        return measurements(made, replace(frame, y=frame.y + moved), frame.seen, np.ones(1, np.bool_), 1.0)
+
+    now, last = of(step), (v2, frame)
+    skew = update_skew(made, None, None, now, v2 + step, last=last)
     assert skew is not None
     np.testing.assert_allclose(skew.change, step, rtol=1e-9)
     np.testing.assert_allclose(skew.later, [step, 0.0 * step], rtol=1e-9)
+    assert skew.due
+    assert skew.replayed.single
     # Until the next replay may be due, its age is kept.
+    skew = skew.replayed
     for age in (1, 2, 3):
-        skew = update_skew(made, skew.replayed if age == 1 else skew, None, now, 1.0 + step, last=1.0 + step)
+        skew = update_skew(made, skew, None, now, v2 + step, last=(v2 + step, frame))
         assert skew is not None
         assert (skew.since, skew.due, float(skew.change.max())) == (age, False, 0.0)
-    assert update_skew(made, skew, None, now, 1.0 + step, last=1.0 + step) is None
-    assert update_skew(made, None, None, now, 1.0 + 0.9 * step, last=np.ones(P)) is None
-    assert update_skew(replace(made, step_s=60.0), None, None, now, 1.0 + step, last=np.ones(P)) is None
+    assert update_skew(made, skew, None, now, v2 + step, last=(v2 + step, frame)) is None
+    assert update_skew(made, None, None, of(0.9 * step), v2 + 0.9 * step, last=last) is None
+    assert update_skew(replace(made, step_s=60.0), None, None, now, v2 + step, last=last) is None
+    # Readings that stay do not follow.
+    assert update_skew(made, None, None, of(0.2 * step), v2 + step, last=last) is None
+    assert update_skew(made, None, None, of(0.3 * step), v2 + step, last=last) is not None
 
 
 @pytest.mark.parametrize("largest_s", [0.3, 0.45])
