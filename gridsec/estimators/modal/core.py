@@ -31,6 +31,7 @@ from gridsec.estimators.modal import (
     classes,
     collusion,
     detector,
+    doubts,
     full,
     masking,
     mirrors,
@@ -454,6 +455,27 @@ def unknown_along(columns: Floats, first: int, end: int) -> Change:
         return seen, replay.beside(unknown, columns) if first <= k < end else unknown
 
     return change
+
+
+def widened(core: Core, state: CoreState, std: Floats) -> CoreState:
+    """State with wider errors of the last readings, by replaying them; no onset is pinned that they explain.
+
+    Parameters
+    ----------
+    core, state
+        The core, and the state after a tick.
+    std : (k, p)
+        Standard deviations that the readings of the last k ticks gain, the newest last, squared pu.
+    """
+    count = len(state.history.readings)
+
+    def change(k: int, seen: Bools | None, unknown: Floats | None) -> tuple[Bools | None, Floats | None]:
+        now = k - count
+        return seen, unknown if now < -len(std) else replay.beside(unknown, doubts.singly(std[now]))
+
+    if not count:
+        return state
+    return replace(again(core, state, max(0, count - len(std)), change)[0], masked=state.masked)
 
 
 def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:

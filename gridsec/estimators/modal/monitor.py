@@ -46,7 +46,6 @@ from gridsec.estimators.front.device_checks import (
     track_busbar,
 )
 from gridsec.estimators.front.measurements import (
-    SYNCHRONOUS_S,
     Measurements,
     checked,
     measurements,
@@ -75,12 +74,12 @@ from gridsec.estimators.front.state import (
     Prediction,
     SuspicionRecord,
 )
-from gridsec.estimators.modal import classes, core, doubts, drive, full, masking, record, replay, verdict
+from gridsec.estimators.modal import classes, core, doubts, drive, full, masking, record, verdict
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.doubts import Movements, Unknown
 from gridsec.estimators.modal.estimate import Reconstructed, Spread
-from gridsec.estimators.modal.naming import CONFIRM, alone, final
+from gridsec.estimators.modal.naming import CONFIRM, alone, final, unseen
 from gridsec.estimators.modal.record import Record
 from gridsec.estimators.modal.search import DOUBT
 from gridsec.estimators.plant import Plant
@@ -93,8 +92,6 @@ SETTLING = 32
 """Largest number of ticks at the start of a run that the core gives up for complete readings."""
 HELD = 8
 """Readings from a jump on for which the verdict is open: log M is evaluated twice in them."""
-TAP = 0.05
-"""Largest step of a tap changer, squared pu: 2.5 % of the voltage."""
 PAUSE = 60.0
 """Ticks without a frame that count as a pause for the time of commissioning."""
 
@@ -288,7 +285,8 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     skew = update_skew(front, given.clock_skew, frame.clock_offset, measured, v2, last=last)
     moved = doubts.earlier(front, skew)
     if skew is not None and moved is not None:
-        state, skew = _moved_later(design, state, moved), skew.replayed
+        wider = core.widened(design.core, state.core, moved)
+        state, skew = _unsuspected(replace(state, core=wider)), skew.replayed
     kinds = ingest(front.references, given.attack_kinds, measured.y, measured.available)
     now = changed(
         given,
@@ -353,23 +351,6 @@ def _repeating(state: CoreState, which: Bools) -> CoreState:
     return replace(state, masked=masking.added(state.masked, which)) if any_of(which) else state
 
 
-def _moved_later(design: ModalDesign, state: ModalState, moved: Floats) -> ModalState:
-    """State after the last readings, with the standard deviations (k, p) that these gain."""
-    kernel = state.core
-    count = len(kernel.history.readings)
-    if not count:
-        return state
-
-    def wider(k: int, seen: Bools | None, unknown: Floats | None) -> tuple[Bools | None, Floats | None]:
-        now = k - count
-        return seen, unknown if now < -len(moved) else replay.beside(unknown, doubts.singly(moved[now]))
-
-    kernel = replace(
-        core.again(design.core, kernel, max(0, count - len(moved)), wider)[0], masked=kernel.masked
-    )
-    return _unsuspected(replace(state, core=kernel))
-
-
 # --- Identification ---
 
 
@@ -417,9 +398,11 @@ def _named(
     if suspicion.fits and not any_of(sure):
         # Masked meters alone may have been manipulated before they were masked.
         sure = alone(suspicion.found, masked)
-    if _early(design, after, suspicion):
-        # Readings by clocks that are behind may show what the others do not show yet.
-        return after, evidence
+    skew = state.front.clock_skew
+    if skew is not None and state.core.spell <= skew.wait:
+        off = core.amounts(kernel, state.core, suspicion)[: named.size]
+        if unseen(design.front, kernel.effect, kernel.bound / core.MOST_POWER, skew.lead, off):
+            return after, evidence
     if any_of(sure):
         found = replace(suspicion.found, named=sure)
         now, evidence = core.mask(kernel, state.core, replace(suspicion, found=found))
@@ -433,26 +416,6 @@ def _named(
         if adopted is not state.core:
             return replace(after, core=adopted, suspicion=None), evidence
     return after, evidence
-
-
-def _early(design: ModalDesign, state: ModalState, suspicion: Suspicion) -> bool:
-    """Steps that other clocks do not show yet may explain a false reading of the best explanation.
-
-    The suspicion is younger than the largest clock offset. Loads of the size of their connections, or a step
-    of the tap changer, move the voltage by more than the reading is off.
-    """
-    skew, kernel, at = state.front.clock_skew, design.core, design.plant.meters
-    if skew is None or state.core.spell > skew.wait:
-        return False
-    off = np.abs(core.amounts(kernel, state.core, suspicion)[: at.size])
-    powers = at.size + at
-    most = kernel.bound[powers] / core.MOST_POWER
-    power = np.abs(kernel.effect[design.front.prior.meters][:, powers]) * most
-    # Clocks without a measured offset differ by less than a tick: one load at a time.
-    ahead = np.minimum(skew.lead, 0.0)[:, None] + SYNCHRONOUS_S < skew.lead
-    step = np.where(ahead, power, 0.0).sum(axis=1)
-    step = np.where(skew.lead < SYNCHRONOUS_S, np.maximum(step, np.maximum(power.max(axis=1), TAP)), step)
-    return not any_of(off > step) or any_of((off > 0.0) & (off <= step))
 
 
 def _searched(

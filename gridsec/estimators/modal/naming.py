@@ -1,6 +1,7 @@
 """Final names: meters that searches in turn accuse, masked together or where nothing depends on it.
 
     final(found, named, streak, since, laterals) -> (p,)      meters to mask
+    unseen(design, effect, most, lead, off) -> bool           steps by other clocks may explain them
 
 A search names the meters without which nothing explains the readings. One reading may be an outlier, and the
 first explanation of several faults a part of them: names need searches in turn, `confirmed`. A sole fault is
@@ -25,12 +26,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from gridsec.arrays import Bools, Ints, all_of, any_of
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of
+from gridsec.estimators.front.design import FrontDesign
+from gridsec.estimators.front.measurements import SYNCHRONOUS_S
 from gridsec.estimators.modal.costs import SearchProblem, informed
 from gridsec.estimators.modal.laterals import excess
 from gridsec.estimators.modal.replay import Reading
 from gridsec.estimators.modal.search import SOME, Identification, mixed
 
+TAP = 0.05
+"""Largest step of a tap changer, squared pu: 2.5 % of the voltage."""
 CONFIRM = 2
 """Searches in turn that accuse a fault before it is named. Least readings of a meter that one search names.
 
@@ -158,3 +163,27 @@ def without(problem: SearchProblem, which: Bools) -> SearchProblem:
         y=np.where(rest, problem.y - problem.F[:, N] @ known[:, -1], 0.0),
         F=np.where(np.logical_and.outer(rest, rest), left, 0.0),
     )
+
+
+def unseen(design: FrontDesign, effect: Floats, most: Floats, lead: Floats, off: Floats) -> bool:
+    """Steps that other clocks do not show yet may explain a false reading.
+
+    Loads of the size of their connections, or a step of the tap changer, move the voltage by more than the
+    reading is off. Clocks without a measured offset differ by less than a tick: one load at a time.
+
+    Parameters
+    ----------
+    design
+        The front end.
+    effect, most : (n, q), (q,)
+        Effect of the faults on all places, and the largest connected powers.
+    lead, off : (p,)
+        Clock offsets, s, and amounts of false readings, squared pu.
+    """
+    powers = lead.size + design.plant.meters
+    power = np.abs(effect[design.prior.meters][:, powers]) * most[powers]
+    ahead = np.minimum(lead, 0.0)[:, None] + SYNCHRONOUS_S < lead
+    step = np.where(ahead, power, 0.0).sum(axis=1)
+    step = np.where(lead < SYNCHRONOUS_S, np.maximum(step, np.maximum(power.max(axis=1), TAP)), step)
+    false, beyond = off != 0.0, np.abs(off) > step
+    return not any_of(false) or any_of(false & ~beyond)

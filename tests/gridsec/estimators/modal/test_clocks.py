@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from gridsec.arrays import Bools, Floats
-from gridsec.estimators.modal import monitor
+from gridsec.estimators.modal import core, monitor
+from gridsec.estimators.modal.core import Core, CoreState
 from gridsec.grid.network import Power
 from gridsec.interface import Decision, Verdict
 from tests.gridsec.estimators.modal.streets import prepare
@@ -110,13 +111,13 @@ def test_powers_that_jump_at_every_tick_are_replayed_once_in_an_offset(
 ) -> None:
     """A third of the meters, with clocks that are ahead, reports random powers."""
     scene, random, replays = Scene(12, 3, np.arange(12) < 4), np.random.default_rng(7), []
-    moved_later = monitor._moved_later
+    widened = core.widened
 
-    def counted(*given: object) -> monitor.ModalState:
+    def counted(kernel: Core, state: CoreState, std: Floats) -> CoreState:
         replays.append(1)
-        return moved_later(*given)  # type: ignore[arg-type]
+        return widened(kernel, state, std)
 
-    monkeypatch.setattr(monitor, "_moved_later", counted)
+    monkeypatch.setattr(core, "widened", counted)
 
     def jumps(k: int) -> None:
         scene.street.p[:4] += random.uniform(-10.0, 10.0, 4) / BASE_KVA * (k >= 20)
