@@ -183,7 +183,6 @@ def test_a_false_report_accuses_no_honest_neighbour_and_not_the_busbar(
     np.testing.assert_array_equal(verdict.suspects, told.liars)
 
 
-@pytest.mark.xfail(reason="`modal` names an honest meter")
 def test_rival_with_a_false_power_prevents_the_name_of_an_honest_meter() -> None:
     """Meters 5 and 12 and the power of 12 are false; three honest meters are the cheaper explanation."""
     here, liars = scene(FEEDER), 2
