@@ -169,6 +169,10 @@ class FrontDesign:
         out[self.meter_of[self.meter_of >= 0]] = True
         return out
 
+    def most_among(self, meters: int) -> int:
+        """Largest number of manipulated meters told apart among those with a reading, at least 1."""
+        return max(1, min(self.max_attacked, meters // 3))
+
     def inverters_of(self, meters: Bools) -> Bools:
         """Inverters with a meter that is one of `meters` (p,), (m,)."""
         return np.asarray((self.meter_of >= 0) & meters[self.meter_of])

@@ -218,8 +218,6 @@ _SHORT_S = 10.0
 """Longest tick of which `SYNCHRONOUS_S` is a part that counts, s."""
 _MOVED = 0.5
 """Least change of a voltage by a power that counts for itself, in white deviations, 1."""
-
-
 _FOLLOWED = 0.25
 """Least share of a sudden change of the model that the readings show at the same tick, 1."""
 LastTick = tuple[Floats, Frame]
@@ -326,7 +324,7 @@ def _sudden(
     if last is not None and design.step_s <= _SHORT_S:
         moved = v2 - last[0]
         if any_of(np.abs(moved) > design.allowed):
-            both = measured.available & last[1].seen
+            both = measured.available & last[1].seen & np.isfinite(last[1].y)
             dv, dy = moved[both], (measured.y - last[1].y)[both]
             change = np.abs(moved) if dy @ dv >= _FOLLOWED * (dv @ dv) else change
     if since >= _RESTS and not any_of(change):

@@ -74,7 +74,7 @@ def unread_sentence(
     """
     parts = []
     for origin, sentence in _ORIGINS.items():
-        here = [name for name, one in zip(names, which & (origins == origin), strict=True) if one]
+        here = _where(names, which & (origins == origin))
         if here:
             parts.append(sentence.format(_list(here)))
     return (
@@ -93,7 +93,7 @@ _ORIGINS = {
 
 def clock_sentence(names: tuple[str, ...], which: Bools, limit_s: float) -> str:
     """Meters `which` (p,) with readings of another moment."""
-    found = _list([name for name, one in zip(names, which, strict=True) if one])
+    found = _list(_where(names, which))
     return (
         f"The clock offset of {found} is above {limit_s:g} s: no scale compares the readings with the feeder."
     )
@@ -101,7 +101,7 @@ def clock_sentence(names: tuple[str, ...], which: Bools, limit_s: float) -> str:
 
 def moved_sentence(names: tuple[str, ...], which: Bools) -> str:
     """Meters `which` (p,) with a voltage that changes within the clock offsets."""
-    found = _list([name for name, one in zip(names, which, strict=True) if one])
+    found = _list(_where(names, which))
     return f"The voltage of {found} changes within the clock offsets by more than the accuracy class."
 
 
@@ -122,7 +122,7 @@ def explanations_sentence(design: FrontDesign, explanations: tuple[Explanation, 
 def _explanation(design: FrontDesign, explanation: Explanation) -> str:
     customers, owner = design.plant.feeder.customers, design.plant.droop.customer
     accused = (
-        ("meter", [name for name, bad in zip(design.names, explanation.meters, strict=True) if bad]),
+        ("meter", _where(design.names, explanation.meters)),
         ("inverter", [customers[c] for c in owner[explanation.inverters]]),
         ("reported power", [customers[c] for c in np.flatnonzero(explanation.powers)]),
     )
@@ -130,6 +130,10 @@ def _explanation(design: FrontDesign, explanation: Explanation) -> str:
     if explanation.busbar.any():
         parts.append(busbar_meter(explanation.busbar))
     return " and ".join(parts) if parts else "none of them"
+
+
+def _where(names: tuple[str, ...], which: Bools) -> list[str]:
+    return [names[k] for k in np.flatnonzero(which).tolist()]
 
 
 def _list(names: list[str]) -> str:
@@ -153,7 +157,7 @@ def unvouched(design: FrontDesign, metered: Bools, used: Bools) -> Finding | Non
     if all_of(metered):
         return None
     least = int((design.busbar_incidence > 0.0)[used].sum(axis=0)[~metered].min())
-    most = max(1, min(design.max_attacked, int(used.sum()) // 3))
+    most = design.most_among(int(used.sum()))
     if least > 2 * most:
         return None
     sentence = (

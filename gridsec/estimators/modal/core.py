@@ -17,7 +17,7 @@ loss-corrected power flow.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf, log
 
@@ -448,13 +448,25 @@ def again(
     return replace(now, loads=state.loads), evidence
 
 
-def unknown_along(columns: Floats, first: int, end: int) -> Change:
-    """Change of `again` with more unknown directions, (p, k), from reading `first` to before `end`."""
+def beside_unknown(
+    core: Core, state: CoreState, first: int, columns: Sequence[Floats]
+) -> tuple[CoreState, Evidence]:
+    """Replay of kept readings with more unknown directions; the masked meters stay masked.
+
+    Parameters
+    ----------
+    core, state, first
+        As in `again`.
+    columns : (p, k) each
+        Directions of the readings from `first` on, times their standard deviations.
+    """
 
     def change(k: int, seen: Bools | None, unknown: Floats | None) -> tuple[Bools | None, Floats | None]:
-        return seen, replay.beside(unknown, columns) if first <= k < end else unknown
+        inside = 0 <= k - first < len(columns)
+        return seen, replay.beside(unknown, columns[k - first]) if inside else unknown
 
-    return change
+    now, evidence = again(core, state, first, change)
+    return replace(now, masked=state.masked), evidence
 
 
 def widened(core: Core, state: CoreState, std: Floats) -> CoreState:
@@ -468,14 +480,10 @@ def widened(core: Core, state: CoreState, std: Floats) -> CoreState:
         Standard deviations that the readings of the last k ticks gain, the newest last, squared pu.
     """
     count = len(state.history.readings)
-
-    def change(k: int, seen: Bools | None, unknown: Floats | None) -> tuple[Bools | None, Floats | None]:
-        now = k - count
-        return seen, unknown if now < -len(std) else replay.beside(unknown, doubts.singly(std[now]))
-
     if not count:
         return state
-    return replace(again(core, state, max(0, count - len(std)), change)[0], masked=state.masked)
+    columns = [doubts.singly(each) for each in std[-count:]]
+    return beside_unknown(core, state, count - len(columns), columns)[0]
 
 
 def adopt(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
@@ -725,10 +733,10 @@ def passed(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreStat
     if not length or not length + PASSED <= age <= len(readings) or without < DOUBT:
         return None
     first, apart = len(readings) - age, rivals.APART * np.eye(core.modes.size)
-    now, evidence = again(core, state, first, unknown_along(apart, first, first + length))
+    now, evidence = beside_unknown(core, state, first, length * [apart])
     if now.detector.log_m >= CALM * core.limit:
         return None
-    return replace(now, masked=state.masked), evidence
+    return now, evidence
 
 
 def outlasts(core: Core, state: CoreState, suspicion: Suspicion) -> bool:

@@ -455,11 +455,11 @@ def _without_busbar(
     columns = doubts.WIDER * UNMETERED * H[:, named]
     count = len(kernel.history.readings)
     first = count - int(kernel.detector.onsets.age[suspicion.row])
-    now, evidence = core.again(design.core, kernel, first, core.unknown_along(columns, first, count))
+    now, evidence = core.beside_unknown(design.core, kernel, first, (count - first) * [columns])
     after = replace(
         state,
         front=changed(state.front, busbar=_suspected_busbar(state.front.busbar, named)),
-        core=replace(now, masked=kernel.masked),
+        core=now,
         suspicion=None,
         phases=0 * state.phases,
         due=state.front.ticks + 1,

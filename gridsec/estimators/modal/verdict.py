@@ -476,7 +476,7 @@ def verdict(design: FrontDesign, now: Inputs, estimate: Estimate) -> Finding:
     finding = decide(
         DecisionInputs(
             names=design.names,
-            max_attacked=max(1, min(design.max_attacked, live // 3)),
+            max_attacked=design.most_among(live),
             live=tested,
             suspected=np.zeros(tested.size, dtype=np.bool_),
             named=now.named,

@@ -281,18 +281,13 @@ def _decoded(design: SingleTickDesign, state: SingleTickState, frame: Frame, tru
     whole = _posterior(state.whole, _prior(front, state, uncertainty), noise, available)
     model = _model_error(front, predicted.powers) + predicted.transient
     limits = Limits(design.options.sigmas, model, front.allowed, front.fixed)
-    m = np.where(available, measured.y - v2, 0.0)
+    m, most = np.where(available, measured.y - v2, 0.0), front.most_among(int(np.count_nonzero(available)))
     try:
-        answers = design.decoder(DecoderInput(whole, m, available, limits, _most(front, available)))
+        answers = design.decoder(DecoderInput(whole, m, available, limits, most))
     except DesignInfeasible:
         # A solver without a solution is no evidence, neither for nor against a meter.
         answers = ()
     return _Tick(measured, predicted, uncertainty, skew, m, limits, whole, answers)
-
-
-def _most(front: FrontDesign, available: Bools) -> int:
-    """Largest number of accusations among the meters with a reading, (p,)."""
-    return max(1, min(front.max_attacked, int(np.count_nonzero(available)) // 3))
 
 
 def _prior(front: FrontDesign, state: SingleTickState, now: FrameUncertainty) -> Prior:
@@ -485,7 +480,7 @@ def _of_meters(design: SingleTickDesign, tick: _Tick, left: _Left, named: Bools,
     finding = decide(
         DecisionInputs(
             names=front.names,
-            max_attacked=_most(front, available),
+            max_attacked=front.most_among(int(np.count_nonzero(available))),
             live=available,
             suspected=suspect | left.beyond,
             named=named,
