@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,17 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
+
+
+USABLE_OFFSET_S: Final = 15.0
+"""Largest clock offset of a usable reading at short ticks, s: at a larger one the loads have changed."""
+OFFSET_PART: Final = 0.25
+"""The same at long ticks, as a part of a tick."""
+
+
+def usable_offset(tick_s: float, least_s: float = USABLE_OFFSET_S) -> float:
+    """Largest clock offset of a usable reading, s: `least_s`, or `OFFSET_PART` of a tick if that is longer."""
+    return max(least_s, OFFSET_PART * tick_s)
 
 
 class Decision(StrEnum):

@@ -61,7 +61,7 @@ from gridsec.grid.network import Power
 from gridsec.grid.phased import PhasedFeeder
 from gridsec.grid.radial import Feeder
 from gridsec.grid.three_phase import PHASES, ThreePhaseFeeder
-from gridsec.interface import Frame, PowerOrigin
+from gridsec.interface import Frame, PowerOrigin, usable_offset
 
 __all__ = [
     "ABSURD_PU",
@@ -142,13 +142,18 @@ class Late:
 def late(site: Site, snapshot: Snapshot) -> Late | None:
     """Late powers of a tick; None if all have the time of their voltage.
 
-    `[meters] p_interval_s` of the feeder's file is the age of powers without a time of their own.
+    `[meters] p_interval_s` of the feeder's file is the age of powers without a time of their own. A clock offset
+    beyond `usable_offset` adds to the age: power and voltage are those of another moment.
     """
-    interval = site.tables.meta.meters.p_interval_s
-    if snapshot.p_age_s is None and interval == 0.0:
+    meta, told, off = site.tables.meta, snapshot.p_age_s, np.zeros(site.meters.size)
+    if snapshot.clock_offset_s is not None:
+        off = np.nan_to_num(np.abs(snapshot.clock_offset_s))
+        off = np.where(off > usable_offset(meta.monitor.tick_s), off, 0.0)
+    interval = meta.meters.p_interval_s
+    if told is None and interval == 0.0 and not any_of(off):
         return None
-    told = np.full(site.meters.size, np.nan) if snapshot.p_age_s is None else snapshot.p_age_s
-    age = np.where(np.isnan(told), interval, np.maximum(told, 0.0))
+    told = np.full(off.size, np.nan) if told is None else told
+    age = np.where(np.isnan(told), interval, np.maximum(told, 0.0)) + off
     aged = (age > 0.0) & np.isfinite(snapshot.p_kw)
     if not any_of(aged):
         return None

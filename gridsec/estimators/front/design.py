@@ -22,6 +22,7 @@ from gridsec.estimators.front.reading_history import repeat_limits
 from gridsec.estimators.plant import Plant, check_plant, judging_problems
 from gridsec.grid.devices import ToldError, busbar_error, steady_rounding
 from gridsec.grid.network import Network, Power, Sensitivities
+from gridsec.interface import USABLE_OFFSET_S
 from gridsec.observers.certificates import Certificate, certify, verify
 from gridsec.observers.lmi import contraction
 from gridsec.observers.lure import Lure, close_loop
@@ -78,7 +79,7 @@ class FrontOptions:
     commission_s: float = 86400.0
     stability: float = 0.1
     unread_std_percent: float = 0.5
-    largest_offset_s: float = 15.0
+    largest_offset_s: float = USABLE_OFFSET_S
     widest: float = 0.1
     v2_limits: tuple[float, float] = (0.25, 2.25)
     settled: float = 0.1

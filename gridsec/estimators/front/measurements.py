@@ -37,7 +37,7 @@ from gridsec.estimators.front.posterior import (
     voltage_prior,
 )
 from gridsec.estimators.plant import NO_VOLTAGE, Plant, busbar_errors, losses, usual
-from gridsec.interface import Frame, PowerOrigin
+from gridsec.interface import Frame, PowerOrigin, usable_offset
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,13 +193,9 @@ FALSE_Q = 0.5
 # --- Clock offsets ---
 
 
-_TICK_PART = 0.25
-"""Largest clock offset of a usable reading where ticks are long, as a part of a tick."""
-
-
 def largest_offset(design: FrontDesign) -> float:
     """Largest clock offset of a usable reading, s."""
-    return max(design.options.largest_offset_s, _TICK_PART * design.step_s)
+    return usable_offset(design.step_s, design.options.largest_offset_s)
 
 
 def unusable_offsets(design: FrontDesign, offset_s: Floats | None) -> Bools | None:

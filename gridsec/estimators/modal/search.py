@@ -62,7 +62,7 @@ HOPELESS = 30.0
 NEAR, EXPANDED = 10.0, 6
 """Cost above the best one up to which the sets beside a set are looked at as well, and their number."""
 FAR = 60.0
-"""Cost above the best one, after one change, from which on a set without a meter is not followed, 1."""
+"""Cost above the best one from which on a set without a meter, or a model of the loads, is not followed, 1."""
 STEPS = 4
 """Largest number of steps of a descent, in meters: each may be added, removed and exchanged."""
 RELEVANCE = 12
@@ -213,19 +213,20 @@ def search(
     batches = together(groups)
     read = informed(problem)
     whole = np.zeros((0, problem.meters)) if laterals is None else (laterals & read).astype(np.float64)
-    start = relevant(problem)
-    ends = [_descended(problem, (np.zeros_like(start), start), batches)]
-    for other, _ in rivals:
-        ends.append(_descended(other, (np.zeros_like(start), ends[0].chosen), batches))
-    one_amount = [
-        np.vstack([in_common(end.problem, whole, end.chosen), _nearly_alike(end, batches)]) for end in ends
-    ]
+    start, nothing = relevant(problem), np.zeros(problem.y.size, dtype=np.bool_)
+    ends, one_amount, least = [], [], []
+    for other, cost in ((problem, 0.0), *rivals):
+        starts = _different((nothing, ends[0].chosen if ends else start))
+        end = _best(tuple(_at(other, each) for each in starts), batches)
+        sets = end.chosen[None]
+        if _reach(end) + cost < min(least, default=inf) + FAR:
+            end = _resized(end, starts[-1], batches)
+            sets = np.vstack([in_common(end.problem, whole, end.chosen), _nearly_alike(end, batches)])
+        alike = costs(end.problem, sets, ALIKE) - excess(sets, whole, read)
+        least.append(min(end.cost, float(alike.min())) + cost)
+        ends.append(end)
+        one_amount.append(sets)
     more = (0.0, *(cost for _, cost in rivals))
-    least = [
-        min(end.cost, float((costs(end.problem, sets, ALIKE) - excess(sets, whole, read)).min(initial=inf)))
-        + cost
-        for end, sets, cost in zip(ends, one_amount, more, strict=True)
-    ]
     found, problems = [], list[SearchProblem]()
     for end, sets, best, cost in zip(ends, one_amount, least, more, strict=True):
         if best < min(least) + HOPELESS:
@@ -240,15 +241,20 @@ def search(
     return identified(tuple(problems), tuple(found))
 
 
-def _descended(problem: SearchProblem, starts: tuple[Bools, ...], groups: Groups) -> Tableau:
-    """The cheapest set from some starts, with the prior size that it has."""
-    starts = _different(starts)
-    best = _best(tuple(_at(problem, start) for start in starts), groups)
-    again = _different((best.chosen, starts[-1]))
+def _reach(end: Tableau) -> float:
+    """Least cost of the end of a descent with the size that suits it, and with amounts alike."""
+    problems = end.problem, _sized(end.problem, end.chosen)
+    each = (costs(problem, end.chosen[None], share) for problem in problems for share in (0.0, ALIKE))
+    return float(np.min([*each]))
+
+
+def _resized(best: Tableau, start: Bools, groups: Groups) -> Tableau:
+    """The cheapest set by descents with the sizes of the end of a descent, and of one of its starts."""
+    again = _different((best.chosen, start))
     ends = [
-        _best(tuple(_at(sized, start) for start in again), groups)
-        for sized in (_sized(problem, each) for each in again)
-        if sized is not problem
+        _best(tuple(_at(sized, each) for each in again), groups)
+        for sized in (_sized(best.problem, each) for each in again)
+        if sized is not best.problem
     ]
     return min(ends, key=lambda end: end.cost) if ends else best
 

@@ -471,7 +471,10 @@ def verdict(design: FrontDesign, now: Inputs, estimate: Estimate) -> Finding:
     """
     if now.calm:
         return AGREEMENT
-    tested = now.seen
+    tested, narrow = now.seen, now.evidence.tested | now.unread
+    if now.skew is not None and now.skew.single:
+        # One reading after a sudden change: the next one tests the meter.
+        narrow = narrow | (now.skew.change > 0.0)
     live = int(np.count_nonzero(tested))
     finding = decide(
         DecisionInputs(
@@ -480,7 +483,7 @@ def verdict(design: FrontDesign, now: Inputs, estimate: Estimate) -> Finding:
             live=tested,
             suspected=np.zeros(tested.size, dtype=np.bool_),
             named=now.named,
-            wide=tested & ~(now.evidence.tested | now.unread),
+            wide=tested & ~narrow,
             valid=True,
             settled=now.settled,
             busbar=True,

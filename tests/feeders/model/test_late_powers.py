@@ -105,6 +105,24 @@ def test_a_power_older_than_it_is_worth_is_unread_and_forecast(site: Site) -> No
             np.testing.assert_array_equal(frame.p_std, where.forecast.p_std)
 
 
+@pytest.mark.parametrize("offset", [60.0, -60.0])
+@pytest.mark.parametrize("age", [None, 20.0])
+def test_a_power_beside_a_clock_that_is_far_off_is_of_another_moment(
+    site: Site, offset: float, age: float | None
+) -> None:
+    """Its age is that of the offset and its own; offsets of usable readings change nothing."""
+    where = np.arange(site.meters.size) == 2
+    plain = said(site, age=age)
+    off = replace(plain, clock_offset_s=np.where(where, offset, 15.0))
+    older = np.where(where, 60.0, 0.0) + (age or 0.0)
+    frame, aged, fresh = (to_frame(site, each) for each in (off, replace(plain, p_age_s=older), plain))
+    for name in ("p", "p_error", "q", "q_error", "q_net", "p_std", "p_origin"):
+        np.testing.assert_array_equal(getattr(frame, name), getattr(aged, name))
+    assert frame.p_error[site.meters[2]] > fresh.p_error[site.meters[2]] or age is not None
+    assert frame.p_origin is not None
+    assert frame.p_origin[site.meters[2]] == PowerOrigin.LATE
+
+
 def test_a_stated_interval_is_in_design_and_frames_alike(site: Site) -> None:
     """No frame knows less than the design supposes, whatever the reading."""
     where = stating(site, 60.0)
