@@ -446,15 +446,23 @@ def _without_busbar(
     """State without the readings of some phases of the busbar since the onset.
 
     which: phases among those with a meter. The kept readings are replayed with a busbar voltage that is
-    unknown from the onset on.
+    unknown from the onset on. Where the run has fewer ticks before the onset than since, the filter is that of
+    its start, and all are unknown: errors learned beside a false busbar would be those of the meters.
     """
     kernel, modes = state.core, design.core.modes
     H = modes.model.phases(modes.at)
     named = np.zeros(H.shape[1], dtype=np.bool_)
     named[H.any(axis=0)] = which
     columns = doubts.WIDER * UNMETERED * H[:, named]
-    count = len(kernel.history.readings)
-    first = count - int(kernel.detector.onsets.age[suspicion.row])
+    count, age = len(kernel.history.readings), int(kernel.detector.onsets.age[suspicion.row])
+    first, ticks = count - age, state.front.ticks + 1
+    if 2 * age >= ticks:
+        readings = kernel.history.readings
+        # A record of this run has the same errors.
+        begun = readings[-1][0] - ticks * design.front.step_s
+        state = state if state.kept is None or state.kept.filter.t < begun else replace(state, kept=None)
+        anew = _begun(design.core, state.kept, readings[0][0])
+        kernel, first = replace(kernel, history=replace(anew.history, readings=readings)), 0
     now, evidence = core.beside_unknown(design.core, kernel, first, (count - first) * [columns])
     after = replace(
         state,
