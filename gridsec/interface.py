@@ -32,7 +32,7 @@ OFFSET_PART: Final = 0.25
 
 
 def usable_offset(tick_s: float, least_s: float = USABLE_OFFSET_S) -> float:
-    """Largest clock offset of a usable reading, s: `least_s`, or `OFFSET_PART` of a tick if that is longer."""
+    """Largest clock offset of a usable reading, s: `least_s`, or `OFFSET_PART` of a tick if longer."""
     return max(least_s, OFFSET_PART * tick_s)
 
 

@@ -142,8 +142,8 @@ class Late:
 def late(site: Site, snapshot: Snapshot) -> Late | None:
     """Late powers of a tick; None if all have the time of their voltage.
 
-    `[meters] p_interval_s` of the feeder's file is the age of powers without a time of their own. A clock offset
-    beyond `usable_offset` adds to the age: power and voltage are those of another moment.
+    `[meters] p_interval_s` of the feeder's file is the age of powers without a time of their own. A clock
+    offset beyond `usable_offset` adds to the age: power and voltage are those of another moment.
     """
     meta, told, off = site.tables.meta, snapshot.p_age_s, np.zeros(site.meters.size)
     if snapshot.clock_offset_s is not None:

@@ -62,7 +62,7 @@ HOPELESS = 30.0
 NEAR, EXPANDED = 10.0, 6
 """Cost above the best one up to which the sets beside a set are looked at as well, and their number."""
 FAR = 60.0
-"""Cost above the best one from which on a set without a meter, or a model of the loads, is not followed, 1."""
+"""Cost above the best one from which on a set without a meter, or a model of loads, is not followed, 1."""
 STEPS = 4
 """Largest number of steps of a descent, in meters: each may be added, removed and exchanged."""
 RELEVANCE = 12
