@@ -25,7 +25,7 @@ chong2020 (16) to (18) for the curves; docs/theory-front.md, section 4.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
@@ -48,6 +48,16 @@ class BusbarTrust:
     def named(self) -> Bools:
         """Phases with a meter named as manipulated, (b,)."""
         return ~self.trusted
+
+    def suspecting(self, named: Bools) -> BusbarTrust:
+        """Trust after phases `named` (b,) were named; the mean of their deviation begins."""
+        return replace(
+            self,
+            trusted=self.trusted & ~named,
+            ticks_suspect=np.where(named, 0, self.ticks_suspect),
+            ticks_agreeing=np.where(named, 0, self.ticks_agreeing),
+            off=np.where(named, 0.0, self.off),
+        )
 
 
 def trusted_busbar(phases: int) -> BusbarTrust:

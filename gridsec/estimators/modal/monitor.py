@@ -183,8 +183,8 @@ class ModalState:
         Searches in turn that name each inverter.
     due
         Number of the tick of the next search.
-    kept
-        Record of the learned errors; None before the first tick.
+    kept, start
+        Record of the learned errors, None before the first tick, and that at the start of the run.
     held : (p,)
         Ticks for which a reading that jumped, and drove no inverter, leaves the verdict open.
     injections
@@ -203,6 +203,7 @@ class ModalState:
     inverters: Ints
     due: int
     kept: Record | None
+    start: Record | None
     held: Ints
     injections: InjectionError
     fit: drive.Fit
@@ -237,7 +238,7 @@ def init(design: ModalDesign, t: float, commission: Commission | None = None) ->
     counts = np.zeros(phases.std.size - p - phases.powers, dtype=np.intp)
     none, inverters = np.zeros(p, dtype=np.intp), np.zeros(design.plant.droop.tau.size, dtype=np.intp)
     injections, fit = front.injection_error, drive.fitted(kernel, begun)
-    return ModalState(front, begun, None, none, counts, inverters, 0, before, none, injections, fit)
+    return ModalState(front, begun, None, none, counts, inverters, 0, before, before, none, injections, fit)
 
 
 def _begun(kernel: Core, before: Record | None, t: float) -> CoreState:
@@ -455,35 +456,23 @@ def _without_busbar(
     named[H.any(axis=0)] = which
     columns = doubts.WIDER * UNMETERED * H[:, named]
     count, age = len(kernel.history.readings), int(kernel.detector.onsets.age[suspicion.row])
-    first, ticks = count - age, state.front.ticks + 1
-    if 2 * age >= ticks:
+    first = count - age
+    if 2 * age > state.front.ticks:
+        # Records of this run have the same errors.
+        state = replace(state, kept=state.start)
         readings = kernel.history.readings
-        # A record of this run has the same errors.
-        begun = readings[-1][0] - ticks * design.front.step_s
-        state = state if state.kept is None or state.kept.filter.t < begun else replace(state, kept=None)
         anew = _begun(design.core, state.kept, readings[0][0])
         kernel, first = replace(kernel, history=replace(anew.history, readings=readings)), 0
     now, evidence = core.beside_unknown(design.core, kernel, first, (count - first) * [columns])
     after = replace(
         state,
-        front=changed(state.front, busbar=_suspected_busbar(state.front.busbar, named)),
+        front=changed(state.front, busbar=state.front.busbar.suspecting(named)),
         core=now,
         suspicion=None,
         phases=0 * state.phases,
         due=state.front.ticks + 1,
     )
     return after, evidence
-
-
-def _suspected_busbar(trust: BusbarTrust, named: Bools) -> BusbarTrust:
-    """Trust of the busbar's meter with newly named phases, (b,); the mean of their deviation begins."""
-    return replace(
-        trust,
-        trusted=trust.trusted & ~named,
-        ticks_suspect=np.where(named, 0, trust.ticks_suspect),
-        ticks_agreeing=np.where(named, 0, trust.ticks_agreeing),
-        off=np.where(named, 0.0, trust.off),
-    )
 
 
 # --- Estimate and verdict ---
@@ -821,6 +810,7 @@ def renew(design: ModalDesign, state: ModalState, which: Bools) -> ModalState:
         attack_kinds=replace(kinds, history=forget_readings(kinds.history, which)),
         trust=state.front.trust.replaced(which),
     )
+    kept = record.made(modes, opened, kernel.static)
     return replace(
         state,
         front=now,
@@ -830,7 +820,8 @@ def renew(design: ModalDesign, state: ModalState, which: Bools) -> ModalState:
         phases=0 * state.phases,
         inverters=0 * state.inverters,
         due=0,
-        kept=record.made(modes, opened, kernel.static),
+        kept=kept,
+        start=kept,
         held=np.where(which, 0, state.held),
         fit=drive.fitted(design.core, begun),
     )

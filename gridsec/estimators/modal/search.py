@@ -214,7 +214,7 @@ def search(
     read = informed(problem)
     whole = np.zeros((0, problem.meters)) if laterals is None else (laterals & read).astype(np.float64)
     start, nothing = relevant(problem), np.zeros(problem.y.size, dtype=np.bool_)
-    ends, one_amount, least = [], [], []
+    ends, one_amount, least = list[Tableau](), list[Bools](), list[float]()
     for other, cost in ((problem, 0.0), *rivals):
         starts = _different((nothing, ends[0].chosen if ends else start))
         end = _best(tuple(_at(other, each) for each in starts), batches)

@@ -143,9 +143,23 @@ class TestStreets:
         assert answers[-1][1].busbar.all()
         assert not any(verdict.suspects.any() for _, verdict in answers)
         assert state.kept is None
+        assert not monitor.to_arrays(design, state.commission).keys() & {"filter.b"}
         assert errors(road, answers) < 0.006
         own = monitor.own_errors(design, state.core)
         assert np.abs(own - 2.0 * road.bias).max() < 0.01
+
+    def test_a_record_of_before_outlasts_one_that_lies_soon_after_a_restart(self) -> None:
+        road, design = make(1)
+        state, _ = watch(road, design, 300)
+        learned = monitor.to_arrays(design, state.commission)
+        state = monitor.init(design, road.t, monitor.from_arrays(design, learned))
+        state, _ = watch(road, design, 4, state=state)
+        state, answers = watch(road, design, 20, state=state, change=reads(0.03))
+        assert answers[-1][1].busbar.all()
+        assert state.kept is not None
+        now = monitor.to_arrays(design, state.commission)
+        np.testing.assert_allclose(now["filter.b"], learned["filter.b"], rtol=1e-9)
+        assert errors(road, answers) < 0.004
 
 
 class TestPhases:
