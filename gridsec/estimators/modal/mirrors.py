@@ -14,10 +14,9 @@ the mean of the likelihoods with independent amounts V and with amounts alike, a
 whole feeder. A majority of a lateral that agrees is believed only as far as others confirm it.
 
 **Phases.** A phase of the busbar off by x, with meters A of the phase off by -x, has the same residuals as
-the other meters of the phase off by -x: L is the same. The promise "at most M manipulated meters" excludes a
-whole phase of more than M meters, and the busbar's meter with more than M of its phase. From meters to the
-busbar's meter with others, J' has its own penalty, if that is larger: one meter that is off is no reason to
-doubt all others of its phase.
+the other meters of the phase off by -x: L is the same. The promise "at most M manipulated meters" excludes
+images with more. From meters to the busbar's meter with others, J' has its own penalty, if that is larger:
+one meter that is off is no reason to doubt all others of its phase.
 """
 
 from __future__ import annotations
@@ -132,10 +131,11 @@ def _of_phase(chosen: Bools, near: Neighbourhoods, phase: int, read: Bools) -> t
     image[:p] = (chosen[:p] & ~of_phase) | others
     image[at] = not chosen[at]
     count = int(np.count_nonzero(image[:p]))
+    if count > near.most:
+        return None, accused
     if chosen[at]:
-        # All other meters of the phase; all of them only as far as that is promised.
-        return (image if any_of(others) and (any_of(accused) or count <= near.most) else None), others
-    return (image if any_of(accused) and count <= near.most else None), accused
+        return (image if any_of(others) else None), others
+    return (image if any_of(accused) else None), accused
 
 
 def _apart(likelihood: _Likelihood, rest: Bools, column: Bools) -> float:

@@ -67,7 +67,6 @@ class TestStreets:
         assert not answers[-1][1].busbar.any()
         assert state.front.busbar.trusted.all()
 
-    @pytest.mark.xfail(reason="`modal` names the four meters, and not the busbar's meter beside them")
     def test_beside_as_many_liars_as_can_be_told_apart(self) -> None:
         road, design = make(3)
         state, _ = watch(road, design, 30)

@@ -120,14 +120,18 @@ def test_the_busbar_is_certain_only_where_not_all_meters_may_be_manipulated(
         assert any(each.all() for each in found.chosen[found.weight > 0.1, :12])
 
 
-def test_the_busbar_and_some_meters_have_the_others_as_a_mirror_image() -> None:
-    """The busbar's meter and two meters off by one amount, or the other ten meters: as likely, any count."""
-    of = kernel()
+@pytest.mark.parametrize(("attacked", "named"), [(4, True), (10, False)])
+def test_the_busbar_and_some_meters_have_the_others_as_a_mirror_image(attacked: int, named: bool) -> None:
+    """The busbar's meter and two meters off by one amount, or the other ten, as far as that is promised."""
+    of = kernel(attacked)
     lie = np.where(np.arange(12) < 2, 0.0, 0.04)
     found = looked(of, lie)
-    assert not found.named.any()
-    for meters in (lie > 0.0, lie == 0.0):
-        assert found.weight @ (found.chosen[:, :12] == meters).all(axis=1) > 0.2
+    assert (found.named == (named & (lie == 0.0))).all()
+    both, others = (
+        found.weight @ (found.chosen[:, :12] == each).all(axis=1) for each in (lie == 0.0, lie > 0.0)
+    )
+    assert both > 0.2
+    assert (others > 0.2) != named
 
 
 def test_explanations_without_mirror_images_stay() -> None:

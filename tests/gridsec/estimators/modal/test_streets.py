@@ -132,7 +132,6 @@ class TestGaps:
         _, answers = watch(street, design, 5, state=state, silent=tuple(range(15)))
         assert answers[-1][1].decision is Decision.UNDECIDED
 
-    @pytest.mark.xfail(reason="`modal` leaves a lie of 4 % open without the busbar")
     def test_without_the_busbar_the_meters_say_where_it_is(self) -> None:
         rng = np.random.default_rng(22)
         plant = make_plant(rng, customers=12, drop=0.03)
