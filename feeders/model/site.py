@@ -132,7 +132,7 @@ class Late:
             frame,
             p_error=np.where(which, np.maximum(frame.p_error, self.reach), frame.p_error),
             q_error=np.where(which, np.maximum(frame.q_error, np.maximum(q - low, high - q)), frame.q_error),
-            q_net=np.where(which, np.nan, frame.q_net),
+            q_net=np.where(which | self.useless, np.nan, frame.q_net),
             p_std=np.where(which, p_std, next(told)),
             q_std=np.where(which, q_std, next(told)),
             p_origin=np.where(late, PowerOrigin.LATE, origin).astype(np.intp),

@@ -245,7 +245,7 @@ class ClockSkew:
 
     @property
     def single(self) -> bool:
-        """A sudden change without a measured offset, and none in the last `_RESTS` ticks."""
+        """A sudden change without a measured offset, at most once in `_RESTS` ticks."""
         return self.since == 0 and not any_of(self.lead)
 
     @property

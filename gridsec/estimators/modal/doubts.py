@@ -312,11 +312,15 @@ def _clocks(design: FrontDesign, measured: Measurements, skew: ClockSkew | None)
     """Directions of meters with a voltage that changes within their clock offset, (p, k); None for none."""
     if skew is None:
         return None
-    change = skew.change
-    moved = measured.available & (change > SKEWED * np.sqrt(design.white))
+    moved = measured.available & skewed(design, skew)
     if not any_of(moved):
         return None
-    return singly(np.where(moved, change, 0.0))
+    return singly(np.where(moved, skew.change, 0.0))
+
+
+def skewed(design: FrontDesign, skew: ClockSkew) -> Bools:
+    """Meters with a voltage that changes within their clock offset by more than noise, (p,)."""
+    return np.asarray(skew.change > SKEWED * np.sqrt(design.white))
 
 
 def singly(std: Floats) -> Floats:

@@ -447,8 +447,9 @@ def _without_busbar(
     """State without the readings of some phases of the busbar since the onset.
 
     which: phases among those with a meter. The kept readings are replayed with a busbar voltage that is
-    unknown from the onset on. Where the run has fewer ticks before the onset than since, the filter is that
-    of its start, and all are unknown: errors learned beside a false busbar would be those of the meters.
+    unknown from the onset on. Where the run has no more ticks before the onset than since, the filter begins
+    at the first kept reading with the record at the start of the run, and the busbar is unknown at all of
+    them: errors learned beside a false busbar would be those of the meters.
     """
     kernel, modes = state.core, design.core.modes
     H = modes.model.phases(modes.at)

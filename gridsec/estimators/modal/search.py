@@ -62,7 +62,8 @@ HOPELESS = 30.0
 NEAR, EXPANDED = 10.0, 6
 """Cost above the best one up to which the sets beside a set are looked at as well, and their number."""
 FAR = 60.0
-"""Cost above the best one from which on a set without a meter, or a model of loads, is not followed, 1."""
+"""Cost above the best one from which on a set is not followed, 1: that of a descent under a model of the
+loads, or one without a meter after one change."""
 STEPS = 4
 """Largest number of steps of a descent, in meters: each may be added, removed and exchanged."""
 RELEVANCE = 12
@@ -219,7 +220,7 @@ def search(
         starts = _different((nothing, ends[0].chosen if ends else start))
         end = _best(tuple(_at(other, each) for each in starts), batches)
         sets = end.chosen[None]
-        if _reach(end) + cost < min(least, default=inf) + FAR:
+        if _reach(end, starts[-1], whole, read) + cost < min(least, default=inf) + FAR:
             end = _resized(end, starts[-1], batches)
             sets = np.vstack([in_common(end.problem, whole, end.chosen), _nearly_alike(end, batches)])
         alike = costs(end.problem, sets, ALIKE) - excess(sets, whole, read)
@@ -241,11 +242,12 @@ def search(
     return identified(tuple(problems), tuple(found))
 
 
-def _reach(end: Tableau) -> float:
-    """Least cost of the end of a descent with the size that suits it, and with amounts alike."""
-    problems = end.problem, _sized(end.problem, end.chosen)
-    each = (costs(problem, end.chosen[None], share) for problem in problems for share in (0.0, ALIKE))
-    return float(np.min([*each]))
+def _reach(end: Tableau, start: Bools, whole: Floats, read: Bools) -> float:
+    """Least cost of the end of a descent and of a start, with any size that suits one, and amounts alike."""
+    sets = np.stack(_different((end.chosen, start)))
+    problems = end.problem, *(_sized(end.problem, each) for each in sets)
+    each = [costs(problem, sets, share) for problem in problems for share in (0.0, ALIKE)]
+    return float((np.stack(each) - excess(sets, whole, read)).min())
 
 
 def _resized(best: Tableau, start: Bools, groups: Groups) -> Tableau:

@@ -45,6 +45,7 @@ from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.costs import amounts
 from gridsec.estimators.modal.detector import SIZE, WEIGHTS, Evidence, Tick
+from gridsec.estimators.modal.doubts import skewed
 from gridsec.estimators.modal.filter import Interval
 from gridsec.estimators.modal.search import DOUBT
 from gridsec.estimators.modal.signatures import Onsets
@@ -474,7 +475,7 @@ def verdict(design: FrontDesign, now: Inputs, estimate: Estimate) -> Finding:
     tested, narrow = now.seen, now.evidence.tested | now.unread
     if now.skew is not None and now.skew.single:
         # One reading after a sudden change: the next one tests the meter.
-        narrow = narrow | (now.skew.change > 0.0)
+        narrow = narrow | skewed(design, now.skew)
     live = int(np.count_nonzero(tested))
     finding = decide(
         DecisionInputs(

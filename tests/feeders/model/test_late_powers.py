@@ -100,6 +100,8 @@ def test_a_power_older_than_it_is_worth_is_unread_and_forecast(site: Site) -> No
         assert (frame.p_origin == PowerOrigin.UNREAD).all()
         np.testing.assert_array_equal(frame.p, none.p)
         np.testing.assert_array_equal(frame.p_error, none.p_error)
+        assert np.isnan(frame.q_net).all()
+        assert not np.isnan(to_frame(where, said(where)).q_net[where.meters]).any()
         if where.forecast is not None:
             assert frame.p_std is not None
             np.testing.assert_array_equal(frame.p_std, where.forecast.p_std)
