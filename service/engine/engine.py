@@ -27,6 +27,7 @@ import structlog
 
 from feeders.model.site import Site
 from gridsec.errors import GridsecError
+from gridsec.interface import Cause
 from service.access.signing import MeterKeys
 from service.alarms.incidents import IncidentEvent, event_json
 from service.alarms.state_machine import (
@@ -659,7 +660,8 @@ class Engine:
         def judge(monitor: FeederMonitor) -> None:
             skipped, begun = monitor.skipped, time.thread_time()
             result = self._guarded(monitor, monitor.judge)
-            self.load.count_tick(monitor.name, time.thread_time() - begun)
+            judged = result is None or result.state.cause is not Cause.OVERLOAD
+            self.load.count_tick(monitor.name, time.thread_time() - begun, judged=judged)
             if monitor.skipped > skipped:
                 self.load.count_skipped(monitor.skipped - skipped)
                 self.metrics.skipped.labels(monitor.name).inc(monitor.skipped - skipped)

@@ -203,6 +203,13 @@ MISMATCH_S = 60.0
 """Time for which a refused identity is a condition, s; at least two ticks."""
 OVERLOAD_REASON = "not monitored: the service is overloaded, and discards the readings of this feeder"
 
+PARTIAL, PARTIAL_S = 2, 10.0
+"""Number of ticks after the end of an overload that are not judged, and their largest sum, s.
+
+Some of their readings were discarded. With partial frames `modal` has a full covariance, and takes five times
+as long for 17 ticks: the feeders that return would be the next overload.
+"""
+
 PATIENCE_MIN_S = 5.0
 """Lower limit of `patience_s`, s."""
 
@@ -305,6 +312,7 @@ class FeederMonitor:
         self.pending: deque[Tick] = deque()
         self.skipped = 0
         self.shed = False
+        self._partial = 0  # next ticks with a part of the readings
         self.defect: Exception | None = None
         self._alarm_rules = alarm_rules(site, rules)
         self._display: displayed.Display[TickState] | None = None
@@ -458,10 +466,11 @@ class FeederMonitor:
     def set_shed(self, shed: bool, now: float) -> int:
         """Begin or end the time without monitoring at the wall time, Unix s; it is no evidence of silence.
 
-        Returns the number of ticks that are passed over by it.
+        The next `PARTIAL` ticks after it are not judged. Returns the number of ticks that are passed over.
         """
         passed = self.aligner.pass_over(now) if self._rests else 0
         self.shed = shed
+        self._partial = 0 if shed else min(PARTIAL, int(PARTIAL_S / self.aligner.rules.tick_s))
         self.aligner.excuse()
         # Nothing is decoded meanwhile: problems of refused identities last from the return on.
         self._refused = {meter: problem for meter, (_, problem) in self._mismatches.items()} | self._refused
@@ -552,7 +561,8 @@ class FeederMonitor:
         return state.completed(displayed=(display.newest, display.since)), display
 
     def _judge(self, tick: Tick) -> TickState:
-        if self.shed:
+        if self.shed or self._partial:
+            self._partial = max(0, self._partial - 1)
             # Its readings are discarded unread: no meter is silent.
             return TickState(
                 self.site, replace(tick, silent=()), self.max_attacked, Cause.OVERLOAD, OVERLOAD_REASON

@@ -127,12 +127,12 @@ class LoadControl:
         window.samples += samples
         window.late += lasted_s > LONG_ROUND_S
 
-    def count_tick(self, feeder: str, spent_s: float) -> None:
-        """Add the processor time of a tick, s; the first one of a feeder does not count in its cost."""
+    def count_tick(self, feeder: str, spent_s: float, *, judged: bool = True) -> None:
+        """Add the processor time of a tick, s; the first one that is judged does not count in its cost."""
         load = self.feeders[feeder]
         self.count_forming(feeder, spent_s)
         load.ticks += load.begun
-        load.begun = feeder not in self.shed
+        load.begun = judged and feeder not in self.shed
 
     def count_forming(self, feeder: str, spent_s: float) -> None:
         """Add the processor time of a part of a tick, s."""

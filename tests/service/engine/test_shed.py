@@ -14,7 +14,7 @@ from feeders.model.site import Site, from_tables
 from gridsec.interface import Cause
 from service.alarms.state_machine import AlarmKind
 from service.engine.engine import Engine, RuntimeConfig
-from service.engine.feeder_monitor import MISMATCH_S, design
+from service.engine.feeder_monitor import MISMATCH_S, PARTIAL, design
 from service.ingest.align import Clock
 from service.ingest.queues import Inbox, Sample
 from service.report.feeder_info import SHED_TICK_S
@@ -205,6 +205,30 @@ def test_the_return_of_a_shed_feeder_is_one_tick_without_silence(pair: Pair, res
     assert not any(alarm.kind is AlarmKind.DATA_LOSS for alarm in pair.store.alarms(feeder=OTHER)[0])
 
 
+def test_ticks_with_a_part_of_the_readings_after_a_return_are_not_judged(pair: Pair) -> None:
+    """The return is between the readings of a second: half of them were discarded."""
+    pair.run(20)
+    pair.shed(OTHER)
+    pair.run(3)
+    pair.wall += 0.05
+    samples = list(pair._samples(OTHER, ""))
+    pair.box.put(samples[:7])
+    pair.shed()
+    pair.box.put(samples[7:])
+    pair._cycle(pair.box.drain(10_000))
+    pair.wall += 0.85
+    pair._cycle([])
+    pair.wall += 0.1
+    whole = []
+    for _ in range(5):
+        latest = pair.live.monitors[OTHER].latest
+        assert latest is not None
+        whole.append((pair.cause() is not Cause.OVERLOAD, bool(latest.tick.seen.all())))
+        pair.run(1)
+    assert (False, False) in whole
+    assert whole[PARTIAL:] == [(True, True)] * (5 - PARTIAL)
+
+
 def test_a_shed_feeder_can_be_removed(pair: Pair) -> None:
     pair.run(2)
     pair.shed(OTHER)
@@ -228,8 +252,8 @@ def test_a_shed_feeder_that_is_put_again_stays_shed(pair: Pair) -> None:
     pair.run(16)
     assert (pair.cause(), pair.standing()) == (Cause.OVERLOAD, {(AlarmKind.UNDECIDED, None)})
     pair.shed()
-    # The observer settles; the alarm clears 5 s after that.
-    pair.run(10)
+    # Two ticks are not judged, the observer settles, and the alarm clears 5 s after that.
+    pair.run(12)
     assert pair.cause() is not Cause.OVERLOAD
     assert pair.standing() == set()
 
