@@ -220,7 +220,7 @@ def search(
         starts = _different((nothing, ends[0].chosen if ends else start))
         end = _best(tuple(_at(other, each) for each in starts), batches)
         sets = end.chosen[None]
-        if _reach(end, starts[-1], whole, read) + cost < min(least, default=inf) + FAR:
+        if not least or _reach(end, starts[-1], whole, read) + cost < min(least) + FAR:
             end = _resized(end, starts[-1], batches)
             sets = np.vstack([in_common(end.problem, whole, end.chosen), _nearly_alike(end, batches)])
         alike = costs(end.problem, sets, ALIKE) - excess(sets, whole, read)
