@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
+from math import nan
 from pathlib import Path
 
 from benchmarks._arguments import arguments
@@ -60,7 +61,9 @@ def _draw(picture: str, found: dict[str, list[tuple[int, Held]]], step_us: float
         meters = [each for each, _ in held]
         cost_us, zenoh_us = ([1e6 * getattr(one, of) for _, one in held] for of in ("cost_s", "zenoh_s"))
         axes.loglog(meters, cost_us, "-o", color=color, label=FORMS[form])
-        axes.loglog(meters, zenoh_us, "--", color=color, label="of it zenoh's threads")
+        # A time below the clock's resolution has no place on the axis.
+        shown = [each or nan for each in zenoh_us]
+        axes.loglog(meters, shown, "--", color=color, label="of it zenoh's threads")
     axes.axhline(step_us, color="gray", linestyle=":", label="step of the estimator")
     axes.set_xlabel("meters at one reading per second")
     axes.set_ylabel("processor time of a reading, us")
