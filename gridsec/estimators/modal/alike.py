@@ -67,9 +67,9 @@ class Alike(Tableau):
 
     def __init__(self, problem: SearchProblem, share: float) -> None:
         meter = np.arange(problem.y.size) < problem.meters
-        super().__init__(replace(problem, std=np.where(meter, np.sqrt(1.0 - share), 1.0) * problem.std))
-        self.share = share
-        self.w = np.where(meter, 1.0 / (problem.std * (1.0 - share)), 0.0)
+        self.share, self.w = share, np.where(meter, 1.0 / (problem.std * (1.0 - share)), 0.0)
+        less = replace(problem, std=np.where(meter, np.sqrt(1.0 - share), 1.0) * problem.std)
+        super().__init__(less, self.w)
         self.own = np.where(meter, 1.0 / (1.0 - share), 0.0)
 
     def copy(self) -> Self:
@@ -80,10 +80,9 @@ class Alike(Tableau):
 
     def _common(self) -> tuple[float, float, Floats]:
         """Score and information of the common amount, and the pull of every fault, (q,)."""
-        q, J = self.chosen.size, np.flatnonzero(self.chosen)
-        along = self.w[J] @ self.A[J]
-        information = float(self.own[J].sum() + along[J] @ self.w[J])
-        return float(along[q]), information, np.where(self.chosen, 0.0, self.w) - along[:q]
+        q = self.chosen.size
+        information = float(self.own[self.chosen].sum() + self.A[q + 1, q + 1])
+        return -float(self.A[q, q + 1]), information, self.A[:q, q + 1]
 
     def _term(self, score: Floats | float, information: Floats | float) -> Floats:
         """Cost of the common amount."""
@@ -104,7 +103,7 @@ class Alike(Tableau):
     def amount(self) -> Floats:
         """Posterior means of the amounts of chosen faults, (q,); not defined for others."""
         score, information, pull = self._common()
-        return np.asarray(self.A[:-1, -1] + pull * self._mean(score, information))
+        return np.asarray(super().amount + pull * self._mean(score, information))
 
     def steps(self) -> tuple[Floats, Floats]:
         """Change of the cost by toggling each fault, and its amount times its pivot, (q,)."""
@@ -135,7 +134,7 @@ class Alike(Tableau):
             The sequences, filled up to the same length, and where they are members.
         """
         a, b, pull = self._common()
-        out, free, inner = self.beginnings(members, inside, np.stack([self.A[:-1, -1], pull]))
+        out, free, inner = self.beginnings(members, inside, np.stack([super().amount, pull]))
         more = np.cumsum(free * self.own[members], axis=1)
         out += self._term(a + inner[:, 0, 1], b + more - inner[:, 1, 1]) - self._term(a, b)
         return out

@@ -608,15 +608,15 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     test, known = state.detector, None if before is None else _keeping(before.found)
     rows = [] if state.suspected else [int(evidence.rows[0])]
     rows = list(dict.fromkeys(rows + np.flatnonzero(test.pinned & test.onsets.used).tolist()))
-    rows = sorted(rows, key=lambda row: _misfit(core, _joint(core, _parts(state), row)))
-    found = _searched(core, state, rows[0], known)
-    std, costs = found.problems[0].std, []
-    for row in rows:
-        problem, gain = _problem(core, _joint(core, _parts(state), row), state.history.unknown)
-        costs.append(cost(replace(problem, std=std), found.chosen[0]) - 2.0 * gain)
+    joints = {row: _joint(core, _parts(state), row) for row in rows}
+    rows = sorted(rows, key=lambda row: _misfit(core, joints[row]))
+    problems = [_problem(core, joints[row], state.history.unknown) for row in rows]
+    found = _searched(core, state, problems[0], known)
+    std = found.problems[0].std
+    costs = [cost(replace(one, std=std), found.chosen[0]) - 2.0 * gain for one, gain in problems]
     best = int(np.argmin(costs))
     if best:
-        found = _searched(core, state, rows[best], known)
+        found = _searched(core, state, problems[best], known)
     age = int(test.onsets.age[rows[best]])
     found = mirrors.reflected(found, core.near)
     replacing = () if before is None else before.replacing
@@ -801,10 +801,11 @@ def _joint_under(core: Core, state: CoreState, row: int, model: int) -> Joint:
     return state.rivals[model].joint() if model else _joint(core, _parts(state), row)
 
 
-def _searched(core: Core, state: CoreState, row: int, known: Bools | None) -> Identification:
-    """Explanations since one onset, under the model and under its rivals."""
-    open_ = state.history.unknown
-    model, gain = _problem(core, _joint(core, _parts(state), row), open_)
+def _searched(
+    core: Core, state: CoreState, of_onset: tuple[SearchProblem, float], known: Bools | None
+) -> Identification:
+    """Explanations by `_problem` of one onset, under the model and under its rivals."""
+    open_, (model, gain) = state.history.unknown, of_onset
     if not state.rivals:
         return search(model, core.groups, (), core.near.laterals, known)
     plain, others = state.rivals[0], state.rivals[1:]

@@ -21,6 +21,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import inf, log
@@ -116,8 +117,8 @@ def costs(problem: SearchProblem, sets: Bools, share: float = 0.0) -> Floats:
     The amounts have the prior covariance ``s^2 (share 1 1' + (1 - share) I)``. With a share, a set bears the
     largest charge besides: an unreported load moves neighbours alike as well. With the posterior mean m and
     covariance G of amounts without the common one, and ``w = 1 / (s (1 - share))`` for k meters, the score
-    and the information of the common amount are ``w' m`` and ``k / (1 - share) - w' G w``. The factor of the
-    faults that all sets have is computed once; each set then takes O(n^3) for n others.
+    and the information of the common amount are ``w' m`` and ``k / (1 - share) - w' G w``. A set takes O(n^3)
+    for the n faults in which it differs from those beside it.
 
     Parameters
     ----------
@@ -131,27 +132,71 @@ def costs(problem: SearchProblem, sets: Bools, share: float = 0.0) -> Floats:
     meters = np.count_nonzero(sets[:, : problem.meters], axis=1)
     out = penalties(problem.meters)[meters] + (problem.charge.max(initial=0.0) if share else 0.0)
     problem, sets = among(problem, np.logical_or.reduce(sets, axis=0)), sets[:, sets.any(axis=0)]
-    p, q, shared = problem.meters, problem.y.size, np.logical_and.reduce(sets, axis=0)
-    std = np.where(np.arange(q) < p, np.sqrt(1.0 - share), 1.0) * problem.std
-    base = Tableau(replace(problem, std=std)).pivot(shared)
-    at, inside = padded(sets & ~shared)
-    n, J = np.arange(at.shape[1]), np.flatnonzero(shared[:p])
-    A = base.A[at[:, :, None], at[:, None, :]] * (inside[:, :, None] & inside[:, None, :])
-    A[:, n, n] += ~inside
-    pulls = [np.where(inside, base.A[at, q], 0.0)]
-    if share:
-        w = np.where(np.arange(q) < p, 1.0 / (problem.std * (1.0 - share)), 0.0)
-        felt = w - w[J] @ base.A[J, :q]
-        pulls.append(np.where(inside, felt[at], 0.0))
-    log_det, inner = _inner(A, np.stack(pulls, axis=1))
-    out = out + base.cost - base.penalty[base.count] + log_det - inner[:, 0, 0]
-    out += np.where(inside, (base.size + problem.charge)[at], 0.0).sum(axis=1)
-    if share:
-        score = w[J] @ base.A[J, q] + inner[:, 0, 1]
-        information = meters / (1.0 - share) + w[J] @ base.A[np.ix_(J, J)] @ w[J] - inner[:, 1, 1]
-        information = np.maximum(information, 0.0)
-        out += np.log1p(share * information) - score * score / (information + 1.0 / share)
+    q, meter = problem.y.size, np.arange(problem.y.size) < problem.meters
+    borders = (np.where(meter, 1.0 / (problem.std * (1.0 - share)), 0.0),) if share else ()
+    problem = replace(problem, std=np.where(meter, np.sqrt(1.0 - share), 1.0) * problem.std)
+    for base, rows, at, inside in _beside(problem, sets, borders):
+        log_det, inner = base.block(at, inside)
+        sign = np.where(base.chosen[at], -1.0, 1.0) * inside
+        out[rows] += base.cost - base.penalty[base.count] + log_det - inner[:, 0, 0]
+        out[rows] += (sign * (base.size + problem.charge)[at]).sum(axis=1)
+        if share:
+            score = inner[:, 0, 1] - base.A[q, q + 1]
+            information = meters[rows] / (1.0 - share) + base.A[q + 1, q + 1] - inner[:, 1, 1]
+            information = np.maximum(information, 0.0)
+            out[rows] += np.log1p(share * information) - score * score / (information + 1.0 / share)
     return np.asarray(out)
+
+
+def _beside(
+    problem: SearchProblem, sets: Bools, borders: Sequence[Floats] = ()
+) -> Iterator[tuple[Tableau, Ints, Ints, Bools]]:
+    """Tableaus, rows of sets (k, q) beside their sets, and the faults in which these differ, (j, n).
+
+    One is pivoted on the faults of most sets. Those that differ in more than `APART` are beside the faults that
+    all of them have. n doubles at most from the fewest to the most of the sets that come together.
+    """
+    most = 2 * np.count_nonzero(sets, axis=0) > len(sets)
+    near = np.count_nonzero(sets ^ most, axis=1) <= APART
+    for which, own in ((near, most), (~near, np.logical_and.reduce(sets[~near], axis=0))):
+        if not which.any():
+            continue
+        base, rows, differ = Tableau(problem, *borders).pivot(own), np.flatnonzero(which), sets[which] ^ own
+        doubles = np.ceil(np.log2(np.maximum(np.count_nonzero(differ, axis=1), 1)))
+        for each in np.unique(doubles):
+            yield base, rows[doubles == each], *padded(differ[doubles == each])
+
+
+def explained(problem: SearchProblem, sets: Bools, weight: Floats, T: Floats) -> tuple[Floats, Floats]:
+    """Means of ``T f`` for the amounts f of some sets, (k, n), and the sum of their variances by weight, (n,).
+
+    With T as borders of the tableau of a set, ``T f`` and its covariance are entries of the tableau. A set
+    that differs from it by the faults D changes them by ``U_D A_DD^-1 v_D`` and ``U_D A_DD^-1 U_D'``.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    sets : (k, q)
+        The sets.
+    weight : (k,)
+        Their weights.
+    T : (n, q)
+        Effects of the faults.
+    """
+    used = np.logical_or.reduce(sets, axis=0)
+    problem, sets, T = among(problem, used), sets[:, used], T[:, used]
+    q, mean, variance = problem.y.size, np.zeros((len(sets), len(T))), np.zeros(len(T))
+    for base, rows, at, inside in _beside(problem, sets):
+        J = np.flatnonzero(base.chosen)
+        U = np.where(base.chosen, 0.0, T) - T[:, J] @ base.A[J, :q]
+        inverse = np.linalg.inv(base.within(at, inside)) * (inside[:, :, None] & inside[:, None, :])
+        along, turn = np.zeros((rows.size, q)), np.zeros((q, q))
+        np.add.at(along, (np.arange(rows.size)[:, None], at), np.vecdot(inverse, base.A[at, q][:, None, :]))
+        np.add.at(turn, (at[:, :, None], at[:, None, :]), weight[rows, None, None] * inverse)
+        mean[rows] = T[:, J] @ base.A[J, q] + along @ U.T
+        variance += weight[rows].sum() * (U[:, J] * T[:, J]).sum(axis=1) + ((U @ turn) * U).sum(axis=1)
+    return mean, variance
 
 
 def mean_likelihood(each: Floats) -> Floats:
@@ -199,13 +244,6 @@ def _fits(A: Floats, v: Floats) -> tuple[Floats, Floats]:
     return 2.0 * np.cumsum(np.log(diagonal), axis=1), np.cumsum(white[:, :, None] * white[:, None], axis=3)
 
 
-def _inner(A: Floats, v: Floats) -> tuple[Floats, Floats]:
-    """``log det A`` (k,) and ``v A^-1 v'`` (k, r, r) of stacked definite matrices and rows v (k, r, n)."""
-    half, n = _bordered(A, v), v.shape[2]
-    white, diagonal = half[:, n:, :n], np.einsum("kii->ki", half)[:, :n]
-    return 2.0 * np.log(diagonal).sum(axis=1), white @ white.transpose(0, 2, 1)
-
-
 def _bordered(A: Floats, v: Floats) -> Floats:
     """Cholesky factors of stacked definite matrices with rows v (k, r, n) below them, (k, n + r, n + r)."""
     k, r, n = v.shape
@@ -216,6 +254,8 @@ def _bordered(A: Floats, v: Floats) -> Floats:
     return np.linalg.cholesky(bordered)
 
 
+APART = 16
+"""Faults in which a set differs from another one up to which its cost is that of a few toggles, 1."""
 _HUGE = 1e200
 """Above all ``v' A^-1 v``."""
 
@@ -252,16 +292,17 @@ class Tableau:
     ----------
     problem
         The problem.
+    borders : (q,) each
+        Rows beside the scores that are pivoted with these.
     """
 
-    def __init__(self, problem: SearchProblem) -> None:
-        q = problem.y.size
+    def __init__(self, problem: SearchProblem, *borders: Floats) -> None:
+        q, rows = problem.y.size, np.stack([problem.y, *borders])
         self.problem, self.penalty = problem, penalties(problem.meters)
-        self.A = np.empty((q + 1, q + 1), order="F")
+        self.A = np.zeros((q + len(rows), q + len(rows)), order="F")
         self.A.T[:q, :q] = problem.F
         self.A[np.arange(q), np.arange(q)] += problem.std**-2.0
-        self.A[q, :q] = self.A[:q, q] = problem.y
-        self.A[q, q] = 0.0
+        self.A[q:, :q], self.A[:q, q:] = rows, rows.T
         self.chosen = np.zeros(q, dtype=np.bool_)
         self.barred = np.zeros(q, dtype=np.bool_)
         self.cost = 0.0
@@ -275,7 +316,7 @@ class Tableau:
         chosen : (q,)
             The set.
         """
-        J = np.flatnonzero(chosen)
+        J, q = np.flatnonzero(chosen), chosen.size
         if not J.size:
             return self
         columns = self.A[:, J]
@@ -286,7 +327,7 @@ class Tableau:
         beside[J] = -np.tril(inverse) - np.tril(inverse, -1).T
         self.A -= white @ white.T
         self.A[:, J], self.A[J] = beside, beside.T
-        self.cost = 2.0 * float(np.log(half.diagonal()).sum()) - float(white[-1] @ white[-1])
+        self.cost = 2.0 * float(np.log(half.diagonal()).sum()) - float(white[q] @ white[q])
         self.cost += float(self.size[J].sum() + self.problem.charge[J].sum())
         self.chosen = chosen.copy()
         self.cost += float(self.penalty[self.count])
@@ -313,7 +354,8 @@ class Tableau:
     @property
     def amount(self) -> Floats:
         """Posterior means of the amounts of chosen faults, (q,); not defined for others."""
-        return self.A[:-1, -1]
+        q = self.chosen.size
+        return self.A[:q, q]
 
     def changes(self) -> Floats:
         """Change of the cost by toggling each fault, (q,); inf where it is barred or would be impossible."""
@@ -361,6 +403,19 @@ class Tableau:
         both += self.penalty[np.minimum(count, p)] - self.penalty[k]
         return both, pull, pivot
 
+    def within(self, members: Ints, inside: Bools) -> Floats:
+        """Blocks of the tableau for some sets, (k, g, g), filled up by those of the identity; as in `toggled`."""
+        n = np.arange(members.shape[1])
+        A = self.A[members[:, :, None], members[:, None, :]] * (inside[:, :, None] & inside[:, None, :])
+        A[:, n, n] += ~inside
+        return A
+
+    def block(self, members: Ints, inside: Bools) -> tuple[Floats, Floats]:
+        """``log |det A|`` (k,) and ``v A^-1 v'`` (k, r, r) of these blocks and the rows v of the borders."""
+        A, v = self.within(members, inside), self.A[self.chosen.size :, members].transpose(1, 0, 2)
+        v = v * inside[:, None, :]
+        return np.linalg.slogdet(A)[1], v @ np.linalg.solve(A, v.transpose(0, 2, 1))
+
     def toggled(self, members: Ints, inside: Bools) -> Floats:
         """Change of the cost by toggling sets of meters, (k,).
 
@@ -371,13 +426,9 @@ class Tableau:
         members, inside : (k, g)
             The sets, filled up to the same size, and where they are members.
         """
-        q, p, n = self.chosen.size, self.problem.meters, np.arange(members.shape[1])
-        A = self.A[members[:, :, None], members[:, None, :]] * (inside[:, :, None] & inside[:, None, :])
-        A[:, n, n] += ~inside
-        v = np.where(inside, self.A[members, q], 0.0)
+        p, (log_det, inner) = self.problem.meters, self.block(members, inside)
         sign = np.where(self.chosen[members], -1.0, 1.0) * inside
-        out = np.linalg.slogdet(A)[1] + (sign * self.size[members]).sum(axis=1)
-        out -= (v * np.linalg.solve(A, v[:, :, None])[:, :, 0]).sum(axis=1)
+        out = log_det - inner[:, 0, 0] + (sign * self.size[members]).sum(axis=1)
         count = self.count + sign.sum(axis=1).astype(np.intp)
         return np.asarray(out + self.penalty[np.minimum(count, p)] - self.penalty[self.count])
 
@@ -408,7 +459,7 @@ class Tableau:
         self.A[j, j] = -1.0 / d
         size = log(abs(d)) + (-self.size[j] if self.chosen[j] else self.size[j])
         added = -1 if self.chosen[j] else 1
-        self.cost += size - column[-1] ** 2 / d + added * self.problem.charge[j]
+        self.cost += size - column[self.chosen.size] ** 2 / d + added * self.problem.charge[j]
         self.chosen[j] = not self.chosen[j]
         self.cost += self.penalty[self.count] - self.penalty[k]
 
@@ -422,7 +473,8 @@ class Tableau:
         members, inside : (k, g)
             The sequences, filled up to the same length, and where they are members.
         """
-        return self.beginnings(members, inside, self.A[None, :-1, -1])[0]
+        q = self.chosen.size
+        return self.beginnings(members, inside, self.A[:q, q : q + 1].T)[0]
 
     def beginnings(self, members: Ints, inside: Bools, rows: Floats) -> tuple[Floats, Bools, Floats]:
         """The same, new members (k, g), and the products of rows (r, q) over the new members, (k, r, r, g).

@@ -32,7 +32,7 @@ import numpy as np
 
 from gridsec.arrays import PENDING, Bools, Floats, deferred, indices, submatrix
 from gridsec.estimators.front.output import BoundedEstimate, BoundInputs
-from gridsec.estimators.modal.costs import SearchProblem, amounts, mean_amounts
+from gridsec.estimators.modal.costs import explained
 from gridsec.estimators.modal.filter import FilterState, Full
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.search import DOUBT, Identification
@@ -265,20 +265,20 @@ def corrected(before: Sequence[Estimated], T: Sequence[Floats], found: Identific
     """
     counted = found.weight >= COUNTED
     weight = found.weight[counted] / found.weight[counted].sum()
-    every = list(zip(found.model[counted].tolist(), found.chosen[counted], strict=True))
-    means = np.stack(
-        [
-            before[model].mean + T[model][:, chosen] @ mean_amounts(found.problems[model], chosen)
-            for model, chosen in every
-        ]
-    )
+    model, chosen = found.model[counted], found.chosen[counted]
+    means, by_amounts = np.empty((weight.size, len(T[0]))), np.zeros(len(T[0]))
+    for k in np.unique(model).tolist():
+        of = model == k
+        moved, variance = explained(found.problems[k], chosen[of], weight[of], T[k])
+        means[of] = before[k].mean + moved
+        by_amounts += variance
     mean = weight @ means
 
     def spread() -> Floats:
-        each = [before[k].variance + _of_amounts(T[k], found.problems[k], chosen) for k, chosen in every]
+        before_each = sum(weight[model == k].sum() * before[k].variance for k in np.unique(model).tolist())
         apart = (means - mean) ** 2
         possible = apart[weight >= DOUBT].max(axis=0)
-        return np.asarray(np.maximum(weight @ (np.stack(each) + apart), POSSIBLE * possible))
+        return np.asarray(np.maximum(before_each + by_amounts + weight @ apart, POSSIBLE * possible))
 
     return Estimated(mean, spread)
 
@@ -308,12 +308,6 @@ class Spread:
         if self.places is not None:
             out[self.places] = np.maximum(out[self.places], self.least)
         return out
-
-
-def _of_amounts(T: Floats, problem: SearchProblem, chosen: Bools) -> Floats:
-    """Variance by the amounts of one explanation, (n,)."""
-    moved = T[:, chosen]
-    return np.asarray(((moved @ amounts(problem, chosen)[1]) * moved).sum(axis=1))
 
 
 class Reconstructed(BoundedEstimate):

@@ -222,7 +222,7 @@ def search(
         sets = end.chosen[None]
         if not least or _reach(end, starts[-1], whole, read) + cost < min(least) + FAR:
             end = _resized(end, starts[-1], batches)
-            sets = np.vstack([in_common(end.problem, whole, end.chosen), _nearly_alike(end, batches)])
+            sets = np.vstack([in_common(end.problem, whole, end.chosen), _nearly_alike(end, batches, whole, read)])
         alike = costs(end.problem, sets, ALIKE) - excess(sets, whole, read)
         least.append(min(end.cost, float(alike.min())) + cost)
         ends.append(end)
@@ -302,12 +302,13 @@ def _explored(
     return found
 
 
-def _nearly_alike(best: Tableau, groups: Groups) -> Bools:
+def _nearly_alike(best: Tableau, groups: Groups, whole: Floats, read: Bools) -> Bools:
     """Ends of descents with amounts alike, sets beside them, and those without each meter, (k, q).
 
     The descents start with the best set, and without faults other than meters: with its meters, and with
     the relaxations of one prior standard deviation. Powers explain a part of a group, and no step beside
-    them is worth its penalty then. The best end is continued from its relaxation.
+    them is worth its penalty then. The best end is continued from its relaxation. One that costs `FAR` more
+    than the best set, as where amounts differ, is not followed.
 
     Parameters
     ----------
@@ -315,6 +316,8 @@ def _nearly_alike(best: Tableau, groups: Groups) -> Bools:
         The best set with independent amounts.
     groups
         Groups of neighbours.
+    whole, read
+        Laterals that may be manipulated as a whole, (G, p), and meters with readings, (p,).
     """
     problem, meter = best.problem, np.arange(best.chosen.size) < best.problem.meters
     met = set[bytes]()
@@ -331,7 +334,10 @@ def _nearly_alike(best: Tableau, groups: Groups) -> Bools:
         ends.append(end(best.chosen, np.zeros_like(meter)))
     least = min(ends, key=lambda each: each.whole)
     more = end(least.relaxed(), least.barred)
-    return _beside_alike(min(least, more, key=lambda each: each.whole), groups)
+    least = min(least, more, key=lambda each: each.whole)
+    if least.whole - float(excess(least.chosen[None], whole, read)[0]) > best.cost + FAR:
+        return least.chosen[None]
+    return _beside_alike(least, groups)
 
 
 def _beside_alike(end: Alike, groups: Groups) -> Bools:
