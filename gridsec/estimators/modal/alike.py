@@ -44,7 +44,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, Ints, submatrix
-from gridsec.estimators.modal.costs import SearchProblem, Tableau, informed
+from gridsec.estimators.modal.costs import SearchProblem, Tableau, among, informed
 
 HALF = 0.5
 """Share from which on a meter is in the set of the relaxation, and at its start, 1."""
@@ -63,9 +63,13 @@ class Alike(Tableau):
         The problem.
     share
         Share in common of the meters' variance, above 0 and below 1.
+    used : (q,)
+        Faults of the problem that sets may contain; None: all. q is their number from then on.
     """
 
-    def __init__(self, problem: SearchProblem, share: float) -> None:
+    def __init__(self, problem: SearchProblem, share: float, used: Bools | None = None) -> None:
+        self.charge = float(problem.charge.max(initial=0.0))
+        problem = problem if used is None else among(problem, used)
         meter = np.arange(problem.y.size) < problem.meters
         self.share, self.w = share, np.where(meter, 1.0 / (problem.std * (1.0 - share)), 0.0)
         less = replace(problem, std=np.where(meter, np.sqrt(1.0 - share), 1.0) * problem.std)
@@ -75,7 +79,7 @@ class Alike(Tableau):
     def copy(self) -> Self:
         """A tableau that can be changed without changing this one."""
         out = super().copy()
-        out.share, out.w, out.own = self.share, self.w, self.own
+        out.share, out.w, out.own, out.charge = self.share, self.w, self.own, self.charge
         return out
 
     def _common(self) -> tuple[float, float, Floats]:
@@ -97,7 +101,7 @@ class Alike(Tableau):
     def whole(self) -> float:
         """Cost of the set with amounts alike, with the charge of that."""
         score, information, _ = self._common()
-        return self.cost + float(self._term(score, information)) + float(self.problem.charge.max(initial=0.0))
+        return self.cost + float(self._term(score, information)) + self.charge
 
     @property
     def amount(self) -> Floats:

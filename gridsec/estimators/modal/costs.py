@@ -153,8 +153,8 @@ def _beside(
 ) -> Iterator[tuple[Tableau, Ints, Ints, Bools]]:
     """Tableaus, rows of sets (k, q) beside their sets, and the faults in which these differ, (j, n).
 
-    One is pivoted on the faults of most sets. Those that differ in more than `APART` are beside the faults that
-    all of them have. n doubles at most from the fewest to the most of the sets that come together.
+    One is pivoted on the faults of most sets. Those that differ in more than `APART` are beside the faults
+    that all of them have. n doubles at most from the fewest to the most of the sets that come together.
     """
     most = 2 * np.count_nonzero(sets, axis=0) > len(sets)
     near = np.count_nonzero(sets ^ most, axis=1) <= APART
@@ -168,7 +168,7 @@ def _beside(
 
 
 def explained(problem: SearchProblem, sets: Bools, weight: Floats, T: Floats) -> tuple[Floats, Floats]:
-    """Means of ``T f`` for the amounts f of some sets, (k, n), and the sum of their variances by weight, (n,).
+    """Means of ``T f`` by the amounts f of some sets, (k, n), and the sum of the variances by weight, (n,).
 
     With T as borders of the tableau of a set, ``T f`` and its covariance are entries of the tableau. A set
     that differs from it by the faults D changes them by ``U_D A_DD^-1 v_D`` and ``U_D A_DD^-1 U_D'``.
@@ -404,7 +404,7 @@ class Tableau:
         return both, pull, pivot
 
     def within(self, members: Ints, inside: Bools) -> Floats:
-        """Blocks of the tableau for some sets, (k, g, g), filled up by those of the identity; as in `toggled`."""
+        """Blocks of the tableau for some sets, (k, g, g), filled up by the identity; as in `toggled`."""
         n = np.arange(members.shape[1])
         A = self.A[members[:, :, None], members[:, None, :]] * (inside[:, :, None] & inside[:, None, :])
         A[:, n, n] += ~inside

@@ -30,7 +30,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from gridsec.arrays import PENDING, Bools, Floats, deferred, indices, submatrix
+from gridsec.arrays import PENDING, Floats, deferred, indices, submatrix
 from gridsec.estimators.front.output import BoundedEstimate, BoundInputs
 from gridsec.estimators.modal.costs import explained
 from gridsec.estimators.modal.filter import FilterState, Full

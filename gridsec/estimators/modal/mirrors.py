@@ -14,9 +14,10 @@ the mean of the likelihoods with independent amounts V and with amounts alike, a
 whole feeder. A majority of a lateral that agrees is believed only as far as others confirm it.
 
 **Phases.** A phase of the busbar off by x, with meters A of the phase off by -x, has the same residuals as
-the other meters of the phase off by -x: L is the same. The promise "at most M manipulated meters" excludes
-images with more. From meters to the busbar's meter with others, J' has its own penalty, if that is larger:
-one meter that is off is no reason to doubt all others of its phase.
+the other meters of the phase off by -x: L is the same. The promise "at most M manipulated meters", that of
+the busbar included, excludes images with more where J keeps it. From meters to the busbar's meter with
+others, J' has its own penalty, if that is larger: one meter that is off is no reason to doubt all others of
+its phase.
 """
 
 from __future__ import annotations
@@ -130,12 +131,11 @@ def _of_phase(chosen: Bools, near: Neighbourhoods, phase: int, read: Bools) -> t
     image = chosen.copy()
     image[:p] = (chosen[:p] & ~of_phase) | others
     image[at] = not chosen[at]
-    count = int(np.count_nonzero(image[:p]))
-    if count > near.most:
+    own, count = (int(np.count_nonzero(each[:p]) + np.count_nonzero(each[-b:])) for each in (chosen, image))
+    if own <= near.most < count:
         return None, accused
-    if chosen[at]:
-        return (image if any_of(others) else None), others
-    return (image if any_of(accused) else None), accused
+    column = others if chosen[at] else accused
+    return (image if any_of(column) else None), column
 
 
 def _apart(likelihood: _Likelihood, rest: Bools, column: Bools) -> float:

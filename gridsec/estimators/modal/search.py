@@ -222,7 +222,9 @@ def search(
         sets = end.chosen[None]
         if not least or _reach(end, starts[-1], whole, read) + cost < min(least) + FAR:
             end = _resized(end, starts[-1], batches)
-            sets = np.vstack([in_common(end.problem, whole, end.chosen), _nearly_alike(end, batches, whole, read)])
+            sets = np.vstack(
+                [in_common(end.problem, whole, end.chosen), _nearly_alike(end, batches, whole, read)]
+            )
         alike = costs(end.problem, sets, ALIKE) - excess(sets, whole, read)
         least.append(min(end.cost, float(alike.min())) + cost)
         ends.append(end)
@@ -319,30 +321,28 @@ def _nearly_alike(best: Tableau, groups: Groups, whole: Floats, read: Bools) -> 
     whole, read
         Laterals that may be manipulated as a whole, (G, p), and meters with readings, (p,).
     """
-    problem, meter = best.problem, np.arange(best.chosen.size) < best.problem.meters
-    met = set[bytes]()
+    problem, q, met = best.problem, best.chosen.size, set[bytes]()
+    meters, every = np.arange(q) < problem.meters, np.ones(q, dtype=np.bool_)
 
-    def end(start: Bools, barred: Bools) -> Alike:
-        tableau = Alike(problem, ALIKE).pivot(start)
-        tableau.barred = barred.copy()
-        return descend(tableau, groups, met)
+    def end(start: Bools, used: Bools) -> Alike:
+        return descend(Alike(problem, ALIKE, used).pivot(start), groups, met)
 
-    nothing = Alike(problem, ALIKE)
-    starts = _different((best.chosen & meter, nothing.relaxed(1.0), nothing.relaxed(-1.0)))
-    ends = [end(start, ~meter) for start in starts]
-    if best.chosen[~meter].any():
-        ends.append(end(best.chosen, np.zeros_like(meter)))
+    nothing = Alike(problem, ALIKE, meters)
+    starts = _different((best.chosen[meters], nothing.relaxed(1.0), nothing.relaxed(-1.0)))
+    ends = [end(start, meters) for start in starts]
+    if best.chosen[~meters].any():
+        ends.append(end(best.chosen, every))
     least = min(ends, key=lambda each: each.whole)
-    more = end(least.relaxed(), least.barred)
+    more = end(least.relaxed(), meters if least.chosen.size < q else every)
     least = min(least, more, key=lambda each: each.whole)
-    if least.whole - float(excess(least.chosen[None], whole, read)[0]) > best.cost + FAR:
-        return least.chosen[None]
-    return _beside_alike(least, groups)
+    chosen = np.pad(least.chosen, (0, q - least.chosen.size))
+    if least.whole - float(excess(chosen[None], whole, read)[0]) > best.cost + FAR:
+        return chosen[None]
+    return _beside_alike(Alike(problem, ALIKE).pivot(chosen), groups)
 
 
 def _beside_alike(end: Alike, groups: Groups) -> Bools:
     """A set with amounts alike, those beside it, and those that descents find without each meter, (k, q)."""
-    end.barred[:] = False
     limit = end.whole - 2.0 * log(UNLIKELY)
     found = {end.chosen.tobytes(): end.whole}
     _neighbours(end, found, UNLIKELY)
