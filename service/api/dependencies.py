@@ -30,6 +30,8 @@ MAX_EVENT = (1 << 63) - 1
 """Largest number of an event."""
 NAME = r"^[A-Za-z0-9_-]{1,64}$"
 """Pattern of the names of feeders, meters and targets."""
+RESERVED = 0.2
+"""Part of the event streams that viewers leave open, 1: wall displays must not keep operators out."""
 IDENTITY = "gridsec.identity"
 """Entry of the ASGI scope with the identity of a request that the front of a cluster has authenticated."""
 
@@ -248,11 +250,14 @@ async def json_only(request: Request) -> None:
         raise HTTPException(415, f"the body must be application/json, not {kind or 'of unknown type'}")
 
 
-async def stream_slot(request: Request) -> AsyncIterator[None]:
-    """Count a stream while it is open."""
+async def stream_slot(request: Request, caller: Caller) -> AsyncIterator[None]:
+    """Count a stream while it is open. A part `RESERVED` of the streams is for operators."""
     state = request.app.state
-    if state.streams >= state.max_streams:
-        raise HTTPException(503, f"{state.max_streams} event streams are open already", {"Retry-After": "10"})
+    most = state.max_streams
+    if not caller.role.includes(Role.OPERATOR):
+        most -= int(RESERVED * most)
+    if state.streams >= most:
+        raise HTTPException(503, f"{most} event streams are open already", {"Retry-After": "10"})
     state.streams += 1
     try:
         yield

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -337,6 +337,22 @@ def test_subnets() -> None:
     assert subnet_of("::ffff:192.0.2.1") == subnet_of("192.0.2.1") == "192.0.2.1"
     assert subnet_of("192.0.2.2") != subnet_of("192.0.2.1")
     assert subnet_of("unknown") == "unknown"
+
+
+def test_viewers_leave_a_fifth_of_the_streams_to_operators(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.app.MAX_STREAMS", 5)
+    viewer, operator, admin = (key(tmp_path, role) for role in (Role.VIEWER, Role.OPERATOR, Role.ADMIN))
+    with service(tmp_path) as small, ExitStack() as streams:
+
+        def status(text: str) -> int:
+            path = "/api/v1/alarms/stream"
+            return streams.enter_context(small.http.stream("GET", path, headers=bearer(text))).status_code
+
+        assert [status(viewer) for _ in range(5)] == [200] * 4 + [503]
+        assert status(operator) == 200
+        assert status(admin) == 503
 
 
 @pytest.mark.parametrize("path", [f"/api/v1/feeders/{FEEDER}/stream", "/api/v1/alarms/stream"])
