@@ -168,7 +168,7 @@ def weighed(
             cases += [(replace(case, accused=part), splits - 1) for part in _split(accused, near.laterals)]
     if not any_of(contested):
         return Weighed(found, contested)
-    out = identified(found.problems, by_model)
+    out = identified(found.problems, by_model, found.plain)
     return Weighed(replace(out, named=out.named & ~contested[:p]), contested, tuple(replacing))
 
 

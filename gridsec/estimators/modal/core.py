@@ -605,7 +605,7 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     before
         What an earlier search found: its likely sets count in this one, too. None: none.
     """
-    test, known = state.detector, None if before is None else _keeping(before.found)
+    test, known = state.detector, None if before is None else _keeping(before)
     rows = [] if state.suspected else [int(evidence.rows[0])]
     rows = list(dict.fromkeys(rows + np.flatnonzero(test.pinned & test.onsets.used).tolist()))
     joints = {row: _joint(core, _parts(state), row) for row in rows}
@@ -763,13 +763,15 @@ def outlasts(core: Core, state: CoreState, suspicion: Suspicion) -> bool:
     return bool((again.found.named >= suspicion.found.named).all())
 
 
-def _keeping(found: Identification) -> Bools:
-    """The likeliest sets, (k, q), that keep meters of the best one from names, and the best one."""
-    p, best = found.named.size, found.chosen[0]
+def _keeping(before: Suspicion) -> Bools:
+    """The best set, the likeliest ones that keep its meters from names, and sets of colluding meters, (k, q)."""
+    found, p = before.found, before.found.named.size
+    best, q = found.chosen[0], found.chosen.shape[1]
     lacks = (best[:p] & ~found.chosen[:, :p]).any(axis=1)
+    colluding = [np.pad(each, (0, q - p)) for each in before.replacing]
     # One set may be likely under several models.
     return np.unique(
-        np.vstack([best[None], found.chosen[lacks & (found.weight >= DOUBT)][:RECALLED]]), axis=0
+        np.vstack([best[None], found.chosen[lacks & (found.weight >= DOUBT)][:RECALLED], *colluding]), axis=0
     )
 
 

@@ -83,7 +83,7 @@ def reflected(found: Identification, near: Neighbourhoods) -> Identification:
             cost[key] = min(own + more, cost.get(key, np.inf))
     if sum(map(len, found_by)) == len(found.weight):
         return found
-    return identified(found.problems, found_by)
+    return identified(found.problems, found_by, found.plain)
 
 
 def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iterator[tuple[Bools, float]]:

@@ -16,7 +16,8 @@ loads without a report move neighbours alike as well. Sets with amounts alike ha
 one is not explored further. A set without meter j is looked for from the best set by removing j. The sets
 that differ by one whole group are tried, and those that differ by one meter from each of the likeliest sets.
 All sets met count with the weight exp(-cost / 2). A meter is named if the sets without it have together less
-than `DOUBT` of the weight.
+than `DOUBT` of the weight, and if the likeliest set under the loads as stated has it, too: loads that vary
+far more than stated explain most of a manipulation that is no step, and little is left to find meters by.
 
 References
 ----------
@@ -90,6 +91,8 @@ class Identification:
         Meters without which nothing explains the readings.
     problems
         The problem with the estimated prior size, and those of the rivals.
+    plain : (p,)
+        Meters of the likeliest set under the model of the loads as stated; None for all.
     """
 
     chosen: Bools
@@ -97,6 +100,7 @@ class Identification:
     weight: Floats
     named: Bools
     problems: tuple[SearchProblem, ...]
+    plain: Bools | None = None
 
 
 def descend(tableau: AnyTableau, groups: Groups = (), met: set[bytes] | None = None) -> AnyTableau:
@@ -241,7 +245,8 @@ def search(
         keys = list(met)
         less = excess(np.stack([np.frombuffer(key, dtype=np.bool_) for key in keys]), whole, read)
         found.append({key: met[key] + cost - float(one) for key, one in zip(keys, less, strict=True)})
-    return identified(tuple(problems), tuple(found))
+    plain = np.frombuffer(min(found[0], key=lambda key: found[0][key]), dtype=np.bool_)
+    return identified(tuple(problems), tuple(found), plain[: problem.meters])
 
 
 def _reach(end: Tableau, start: Bools, whole: Floats, read: Bools) -> float:
@@ -480,7 +485,9 @@ def costs_of(found: Identification) -> list[dict[bytes, float]]:
     return out
 
 
-def identified(problems: tuple[SearchProblem, ...], found: Sequence[dict[bytes, float]]) -> Identification:
+def identified(
+    problems: tuple[SearchProblem, ...], found: Sequence[dict[bytes, float]], plain: Bools | None = None
+) -> Identification:
     """Weights of sets, and the meters without which nothing is left.
 
     Parameters
@@ -489,6 +496,8 @@ def identified(problems: tuple[SearchProblem, ...], found: Sequence[dict[bytes, 
         The problem under each model of the loads.
     found
         Costs of the sets under each model, by their bytes.
+    plain : (p,)
+        As in `Identification`: no other meters are named.
     """
     every = sorted((each[key], k, key) for k, each in enumerate(found) for key in each)
     costs = np.array([one for one, _, _ in every])
@@ -499,4 +508,5 @@ def identified(problems: tuple[SearchProblem, ...], found: Sequence[dict[bytes, 
     weight = weight[kept] / weight[kept].sum()
     without = weight @ ~chosen[:, : problems[0].meters]
     model = np.array([k for _, k, _ in every])[kept]
-    return Identification(chosen, model, weight, np.asarray(without < DOUBT), problems)
+    named = without < DOUBT if plain is None else plain & (without < DOUBT)
+    return Identification(chosen, model, weight, np.asarray(named), problems, plain)

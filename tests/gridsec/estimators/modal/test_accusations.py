@@ -16,7 +16,7 @@ RUNS = [
     *(("majority", seed) for seed in (1, 2, 4, 14, 17, 18, 35, 47, 79, 128, 156, 185)),
     *(("phases-busbar", seed) for seed in (0, 33, 35, 36)),
     *(("phases-lateral", seed) for seed in (1, 18, 29, 77, 93)),
-    *(("drift", seed) for seed in (4, 38)),
+    *(("drift", seed) for seed in (4, 38, 210, 232, 288)),
     *(("contiguous-low", seed) for seed in (0, 1, 2)),
     *(("false-power", seed) for seed in (0, 1, 2)),
 ]
