@@ -764,7 +764,7 @@ def outlasts(core: Core, state: CoreState, suspicion: Suspicion) -> bool:
 
 
 def _keeping(before: Suspicion) -> Bools:
-    """The best set, the likeliest ones that keep its meters from names, and sets of colluding meters, (k, q)."""
+    """The best set, likely ones that keep its meters from names, and sets of colluding meters, (k, q)."""
     found, p = before.found, before.found.named.size
     best, q = found.chosen[0], found.chosen.shape[1]
     lacks = (best[:p] & ~found.chosen[:, :p]).any(axis=1)

@@ -72,6 +72,23 @@ def test_changes_and_exchanges_are_those_of_dense_covariances(seed: int) -> None
     assert tableau.copy().changes() == pytest.approx(tableau.changes())
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_part_of_the_faults_costs_what_it_does_beside_barred_ones(seed: int) -> None:
+    given = problem(seed)
+    p, q = given.meters, given.y.size
+    used = np.arange(q) < p
+    few, whole = Alike(given, ALIKE, used), Alike(given, ALIKE)
+    whole.barred = ~used
+    for j in (1, 4, 6, 4):
+        few.toggle(j)
+        whole.toggle(j)
+        assert few.whole == pytest.approx(whole.whole, abs=1e-8)
+        assert few.copy().whole == few.whole
+        assert few.changes() == pytest.approx(whole.changes()[:p], abs=1e-8)
+        assert few.amount[few.chosen] == pytest.approx(whole.amount[whole.chosen], abs=1e-8)
+    assert (few.relaxed() == whole.relaxed()[:p]).all()
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_groups_are_those_of_dense_covariances(seed: int) -> None:
     """All beginnings of a random sequence of meters beside a random set."""

@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gridsec.arrays import Bools
 from gridsec.estimators.modal.costs import (
     SearchProblem,
     Tableau,
     amounts,
     cost,
     costs,
+    explained,
     mean_amounts,
     penalties,
 )
@@ -57,6 +59,40 @@ def test_costs_of_amounts_alike_are_exact(seed: int) -> None:
             exact -= y @ np.linalg.solve(np.eye(at.size) + V @ F, V @ y)
             exact += penalties(p)[np.count_nonzero(at < p)] + given.charge[at].sum() + given.charge.max()
             assert found == pytest.approx(exact, abs=1e-7)
+
+
+def far_apart(given: SearchProblem, random: np.random.Generator) -> Bools:
+    """Sets beside one of twenty meters, sets beside another one, single faults, and nothing."""
+    q, each = given.y.size, list[Bools]()
+    for first in (0, given.meters - 20):
+        one = (np.arange(q) >= first) & (np.arange(q) < first + 20)
+        each += [one ^ (random.random(q) < 0.05) for _ in range(8 if first else 14)]
+    singles = np.eye(q, dtype=np.bool_)[:3]
+    return np.vstack([each, singles, np.zeros((1, q), dtype=np.bool_)])
+
+
+@pytest.mark.parametrize("share", [0.0, ALIKE])
+def test_costs_of_sets_that_are_far_apart_are_those_of_each(share: float) -> None:
+    given, random = problem(1, p=44, others=4, liars=20), np.random.default_rng(1)
+    sets = far_apart(given, random)
+    found = costs(given, sets, share)
+    assert np.allclose(found, [costs(given, each[None], share)[0] for each in sets], atol=1e-6)
+    if not share:
+        assert np.allclose(found, [cost(given, each) for each in sets], atol=1e-6)
+
+
+def test_effects_of_many_sets_are_those_of_each() -> None:
+    """Means and variances of ``T f`` against the inverse of each set's information."""
+    given, random = problem(2, p=44, others=4, liars=20), np.random.default_rng(2)
+    sets = far_apart(given, random)
+    weight, T = random.random(len(sets)), random.normal(size=(7, given.y.size))
+    mean, variance = explained(given, sets, weight, T)
+    expected = np.zeros(7)
+    for chosen, one, w in zip(sets, mean, weight, strict=True):
+        f, cov = amounts(given, chosen)
+        assert one == pytest.approx(T[:, chosen] @ f, abs=1e-7)
+        expected += w * np.einsum("nk,kj,nj->n", T[:, chosen], cov, T[:, chosen])
+    assert variance == pytest.approx(expected, abs=1e-7)
 
 
 @pytest.mark.parametrize("some", [(), (1,), (0, 3, 9)])
