@@ -6,6 +6,7 @@ import asyncio
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Sequence
 from concurrent.futures import Future
+from math import ceil
 from typing import Annotated, Any, Protocol, TypeVar
 
 from anyio import CapacityLimiter, to_thread
@@ -251,18 +252,20 @@ async def json_only(request: Request) -> None:
 
 
 async def stream_slot(request: Request, caller: Caller) -> AsyncIterator[None]:
-    """Count a stream while it is open. A part `RESERVED` of the streams is for operators."""
-    state = request.app.state
+    """Count a stream while it is open. Viewers leave a part `RESERVED` of the streams to operators."""
+    state, viewer = request.app.state, not caller.role.includes(Role.OPERATOR)
     most = state.max_streams
-    if not caller.role.includes(Role.OPERATOR):
-        most -= int(RESERVED * most)
+    of_viewers = most - ceil(RESERVED * most)
     if state.streams >= most:
         raise HTTPException(503, f"{most} event streams are open already", {"Retry-After": "10"})
-    state.streams += 1
+    if viewer and state.viewers >= of_viewers:
+        reason = f"{of_viewers} event streams of viewers are open already"
+        raise HTTPException(503, reason, {"Retry-After": "10"})
+    state.streams, state.viewers = state.streams + 1, state.viewers + viewer
     try:
         yield
     finally:
-        state.streams -= 1
+        state.streams, state.viewers = state.streams - 1, state.viewers - viewer
 
 
 KnownFeeder = Annotated[str, Depends(known_feeder)]

@@ -66,7 +66,7 @@ def create_api(
     app.state.access_threads = CapacityLimiter(ACCESS_THREADS)
     app.state.backend = backend
     app.state.probe = system.Probe(backend.store, authenticator)
-    app.state.streams, app.state.max_streams = 0, max_streams
+    app.state.streams, app.state.viewers, app.state.max_streams = 0, 0, max_streams
     app.state.run = secrets.token_hex(4)
     app.add_middleware(GZipMiddleware, minimum_size=GZIP_BYTES, compresslevel=GZIP_LEVEL)
     app.add_middleware(HeadAsGet)

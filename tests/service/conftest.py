@@ -393,7 +393,7 @@ def _application(service: SmallService) -> FastAPI:
     api = _FREE.pop()
     api.state.backend, api.state.probe = service, Probe(service.store, None)
     api.state.run, api.state.access_threads = secrets.token_hex(4), CapacityLimiter(ACCESS_THREADS)
-    api.state.streams, api.state.max_streams = 0, MAX_STREAMS
+    api.state.streams, api.state.viewers, api.state.max_streams = 0, 0, MAX_STREAMS
     return api
 
 

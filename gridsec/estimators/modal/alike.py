@@ -64,7 +64,7 @@ class Alike(Tableau):
     share
         Share in common of the meters' variance, above 0 and below 1.
     used : (q,)
-        Faults of the problem that sets may contain; None: all. q is their number from then on.
+        Faults of the problem that sets may contain, all meters among them; None: all. q is then their number.
     """
 
     def __init__(self, problem: SearchProblem, share: float, used: Bools | None = None) -> None:

@@ -97,8 +97,8 @@ class Weighed:
         The explanations, with the sets that keep names.
     contested : (q,)
         Meters and phases of the busbar that keep no name.
-    replacing : (p,) each
-        Meters of the sets that keep names.
+    replacing : (q,) each
+        The sets that keep names.
     """
 
     found: Identification
@@ -125,14 +125,14 @@ def weighed(
         Laterals, and the largest number of manipulated meters that is promised.
     left
         Share of the misfit that the likeliest explanation leaves.
-    known : (p,) each
+    known : (q,) each
         Such sets of earlier searches.
     """
     p, J = found.named.size, found.chosen[0]
     first = J.size - near.phases.shape[1]
     named = np.zeros_like(J)
     named[:p] = found.named & ~masked
-    named[first:] = found.weight @ ~found.chosen[:, first:] < DOUBT
+    named[first:] = found.certain[first:]
     if not any_of(named) or (np.count_nonzero(J) == 1 and not any_of(masked)):
         return Weighed(found, np.zeros_like(J))
     most = max(near.most, p // 3)
@@ -147,7 +147,7 @@ def weighed(
     fresh[:p] &= ~masked
     sets = [fresh & (sign * amount > 0.0) for sign in _SIGNS]
     sets += [np.arange(J.size) == k for k in np.flatnonzero(J[first:]) + first]
-    begun = np.vstack([near.laterals, *known])
+    begun = np.vstack([near.laterals, *(each[:p] for each in known)])
     every = _Case(problem, J, amount, J, masked, most, near.powers, begun, min(MISFIT, OPEN * left))
     cases = [(replace(every, accused=each), SPLITS) for each in sets]
     while cases:
@@ -159,7 +159,7 @@ def weighed(
             kept = accused & named & ~other & ~contested
             if any_of(kept):
                 contested |= kept
-                replacing.append(other[:p])
+                replacing.append(other)
                 # No more than J: few meters are likelier than many. What keeps names counts in the estimate.
                 cost = min(by_model[model][J.tobytes()] + max(more, GAIN), _COUNTS)
                 key = other.tobytes()

@@ -578,8 +578,8 @@ class Suspicion:
         The best one explains the misfit since then, and better than errors alike within the classes.
     settled
         It explains nearly all of it.
-    replacing : (p,) each
-        Sets of colluding meters that have kept names, the latest ones first.
+    replacing : (q,) each
+        Sets with colluding meters that have kept names, the latest ones first.
     """
 
     row: int
@@ -766,13 +766,10 @@ def outlasts(core: Core, state: CoreState, suspicion: Suspicion) -> bool:
 def _keeping(before: Suspicion) -> Bools:
     """The best set, likely ones that keep its meters from names, and sets of colluding meters, (k, q)."""
     found, p = before.found, before.found.named.size
-    best, q = found.chosen[0], found.chosen.shape[1]
-    lacks = (best[:p] & ~found.chosen[:, :p]).any(axis=1)
-    colluding = [np.pad(each, (0, q - p)) for each in before.replacing]
+    best = found.chosen[0]
+    lacks = (best[:p] & ~found.chosen[:, :p]).any(axis=1) & (found.weight >= DOUBT)
     # One set may be likely under several models.
-    return np.unique(
-        np.vstack([best[None], found.chosen[lacks & (found.weight >= DOUBT)][:RECALLED], *colluding]), axis=0
-    )
+    return np.unique(np.vstack([best, *found.chosen[lacks][:RECALLED], *before.replacing]), axis=0)
 
 
 def _misfit(core: Core, joint: Joint) -> float:

@@ -182,13 +182,8 @@ class Evidence:
 
     @property
     def rows(self) -> Ints:
-        """Rows of the onsets with the largest parts in M, the largest first, at least one ramp, (`PINS`,)."""
-        part = self.by_row.max(axis=0)
-        order = np.argsort(-part, kind="stable")
-        rows, ramp = order[:PINS], order[order >= _STEPS][0]
-        if part[ramp] > -inf and (rows < _STEPS).all():
-            rows[-1] = ramp
-        return np.asarray(rows)
+        """Rows of the onsets with the largest parts in M, the largest first, (`PINS`,)."""
+        return np.asarray(np.argsort(-self.by_row.max(axis=0), kind="stable")[:PINS])
 
 
 def start(modes: Modes) -> Detector:

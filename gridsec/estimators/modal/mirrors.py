@@ -14,8 +14,8 @@ the mean of the likelihoods with independent amounts V and with amounts alike, a
 whole feeder. A majority of a lateral that agrees is believed only as far as others confirm it.
 
 **Phases.** A phase of the busbar off by x, with meters A of the phase off by -x, has the same residuals as
-the other meters of the phase off by -x: L is the same. The promise "at most M manipulated meters", that of
-the busbar included, excludes images with more where J keeps it. From meters to the busbar's meter with
+the other meters of the phase off by -x: L is the same. The promise "at most M manipulated meters" excludes
+images with more meters where J keeps it, the busbar's meter included. From meters to the busbar's meter with
 others, J' has its own penalty, if that is larger: one meter that is off is no reason to doubt all others of
 its phase.
 """
@@ -131,8 +131,8 @@ def _of_phase(chosen: Bools, near: Neighbourhoods, phase: int, read: Bools) -> t
     image = chosen.copy()
     image[:p] = (chosen[:p] & ~of_phase) | others
     image[at] = not chosen[at]
-    own, count = (int(np.count_nonzero(each[:p]) + np.count_nonzero(each[-b:])) for each in (chosen, image))
-    if own <= near.most < count:
+    own = int(np.count_nonzero(chosen[:p]) + np.count_nonzero(chosen[-b:]))
+    if own <= near.most < np.count_nonzero(image[:p]):
         return None, accused
     column = others if chosen[at] else accused
     return (image if any_of(column) else None), column

@@ -88,11 +88,11 @@ class Identification:
     weight : (k,)
         Their posterior weights; they sum to 1.
     named : (p,)
-        Meters without which nothing explains the readings.
+        Meters that are `certain`.
     problems
         The problem with the estimated prior size, and those of the rivals.
-    plain : (p,)
-        Meters of the likeliest set under the model of the loads as stated; None for all.
+    plain : (q,)
+        The likeliest set under the model of the loads as stated; None for all faults.
     """
 
     chosen: Bools
@@ -101,6 +101,12 @@ class Identification:
     named: Bools
     problems: tuple[SearchProblem, ...]
     plain: Bools | None = None
+
+    @property
+    def certain(self) -> Bools:
+        """Faults without which nothing explains the readings, and that `plain` has, (q,)."""
+        without = self.weight @ ~self.chosen < DOUBT
+        return np.asarray(without if self.plain is None else without & self.plain)
 
 
 def descend(tableau: AnyTableau, groups: Groups = (), met: set[bytes] | None = None) -> AnyTableau:
@@ -246,7 +252,7 @@ def search(
         less = excess(np.stack([np.frombuffer(key, dtype=np.bool_) for key in keys]), whole, read)
         found.append({key: met[key] + cost - float(one) for key, one in zip(keys, less, strict=True)})
     plain = np.frombuffer(min(found[0], key=lambda key: found[0][key]), dtype=np.bool_)
-    return identified(tuple(problems), tuple(found), plain[: problem.meters])
+    return identified(tuple(problems), tuple(found), plain)
 
 
 def _reach(end: Tableau, start: Bools, whole: Floats, read: Bools) -> float:
@@ -488,7 +494,7 @@ def costs_of(found: Identification) -> list[dict[bytes, float]]:
 def identified(
     problems: tuple[SearchProblem, ...], found: Sequence[dict[bytes, float]], plain: Bools | None = None
 ) -> Identification:
-    """Weights of sets, and the meters without which nothing is left.
+    """Weights of sets, and the meters that are certain.
 
     Parameters
     ----------
@@ -496,8 +502,8 @@ def identified(
         The problem under each model of the loads.
     found
         Costs of the sets under each model, by their bytes.
-    plain : (p,)
-        As in `Identification`: no other meters are named.
+    plain : (q,)
+        As in `Identification`: no other faults are certain.
     """
     every = sorted((each[key], k, key) for k, each in enumerate(found) for key in each)
     costs = np.array([one for one, _, _ in every])
@@ -506,7 +512,6 @@ def identified(
     kept = weight >= BELIEVED
     chosen = np.stack([np.frombuffer(key, dtype=np.bool_) for _, _, key in every])[kept]
     weight = weight[kept] / weight[kept].sum()
-    without = weight @ ~chosen[:, : problems[0].meters]
     model = np.array([k for _, k, _ in every])[kept]
-    named = without < DOUBT if plain is None else plain & (without < DOUBT)
-    return Identification(chosen, model, weight, np.asarray(named), problems, plain)
+    out = Identification(chosen, model, weight, chosen[0], problems, plain)
+    return replace(out, named=out.certain[: problems[0].meters])

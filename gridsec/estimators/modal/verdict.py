@@ -47,7 +47,6 @@ from gridsec.estimators.modal.costs import amounts
 from gridsec.estimators.modal.detector import SIZE, WEIGHTS, Evidence, Tick
 from gridsec.estimators.modal.doubts import skewed
 from gridsec.estimators.modal.filter import Interval
-from gridsec.estimators.modal.search import DOUBT
 from gridsec.estimators.modal.signatures import Onsets
 from gridsec.estimators.modal.static import Static
 from gridsec.estimators.plant import NO_VOLTAGE
@@ -331,8 +330,8 @@ def certain_inverters(design: FrontDesign, core: Core, suspicion: Suspicion, use
         As in `explanations`.
     """
     found, first = suspicion.found, core.modes.size + design.customers
-    chosen = found.chosen[:, first : core.modes.size + core.faults.powers]
-    return np.asarray((found.weight @ ~chosen < DOUBT) & ~uses_q[design.plant.droop.customer])
+    certain = found.certain[first : core.modes.size + core.faults.powers]
+    return np.asarray(certain & ~uses_q[design.plant.droop.customer])
 
 
 def inverter_amounts(design: FrontDesign, core: Core, suspicion: Suspicion | None) -> Floats:
@@ -362,7 +361,7 @@ def certain_phases(core: Core, suspicion: Suspicion) -> Bools:
         The core, and the explanations.
     """
     found, first = suspicion.found, core.modes.size + core.faults.powers
-    return np.asarray((found.weight @ ~found.chosen[:, first:] < DOUBT) & ~suspicion.contested)
+    return np.asarray(found.certain[first:] & ~suspicion.contested)
 
 
 def share(  # noqa: PLR0917  # the core, and one report

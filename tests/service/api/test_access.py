@@ -350,9 +350,12 @@ def test_viewers_leave_a_fifth_of_the_streams_to_operators(
             path = "/api/v1/alarms/stream"
             return streams.enter_context(small.http.stream("GET", path, headers=bearer(text))).status_code
 
+        assert status(operator) == 200
+        assert [status(viewer) for _ in range(4)] == [200] * 4
+        assert status(admin) == 503
+    with service(tmp_path) as small, ExitStack() as streams:
         assert [status(viewer) for _ in range(5)] == [200] * 4 + [503]
         assert status(operator) == 200
-        assert status(admin) == 503
 
 
 @pytest.mark.parametrize("path", [f"/api/v1/feeders/{FEEDER}/stream", "/api/v1/alarms/stream"])

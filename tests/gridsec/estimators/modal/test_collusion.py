@@ -153,9 +153,9 @@ def test_sets_that_keep_names_are_known_to_the_next_search() -> None:
     """The sets come back beside the explanations; none where no name is kept."""
     given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
     first = collusion.weighed(explanation(given, some(4, 5)), NONE, near(4))
-    assert [each.tolist() for each in first.replacing] == [some(0, 1, 2, 3).tolist()]
+    assert [each.tolist() for each in first.replacing] == [[*some(0, 1, 2, 3).tolist(), False]]
     again = collusion.weighed(explanation(given, some(4, 5)), NONE, near(4), known=first.replacing)
-    assert [each.tolist() for each in again.replacing] == [some(0, 1, 2, 3).tolist()]
+    assert [each.tolist() for each in again.replacing] == [[*some(0, 1, 2, 3).tolist(), False]]
     assert not collusion.weighed(explanation(given, some(0)), NONE, near(4)).replacing
 
 

@@ -120,6 +120,17 @@ def test_the_busbar_is_certain_only_where_not_all_meters_may_be_manipulated(
         assert any(each.all() for each in found.chosen[found.weight > 0.1, :12])
 
 
+@pytest.mark.parametrize(("attacked", "named"), [(3, False), (4, False), (5, True)])
+def test_as_many_meters_as_are_promised_beside_the_busbar_do_not_keep_the_promise(
+    attacked: int, named: bool
+) -> None:
+    """The busbar's meter and four meters: five keep the promise, and exclude the other eight."""
+    lie = np.where(np.arange(12) % 3 == 0, 0.0, 0.04)
+    found = looked(kernel(attacked), lie)
+    assert (found.named == (named & (lie == 0.0))).all()
+    assert found.certain[-1] == named
+
+
 @pytest.mark.parametrize(("attacked", "named"), [(4, True), (10, False)])
 def test_the_busbar_and_some_meters_have_the_others_as_a_mirror_image(attacked: int, named: bool) -> None:
     """The busbar's meter and two meters off by one amount, or the other ten, as far as that is promised."""

@@ -131,6 +131,21 @@ def test_a_set_of_an_earlier_search_counts_with_the_size_that_suits_it(seed: int
     assert truth.tobytes() in {each.tobytes() for each in kept.chosen}
 
 
+@pytest.mark.parametrize("confirmed", [True, False])
+def test_a_name_needs_the_likeliest_set_under_the_loads_as_stated(confirmed: bool) -> None:
+    """A rival outweighs the problem, and needs one meter: named where the problem's best set has it, too."""
+    p = 9
+    given = problem(0, p=p, liars=0)
+    f = np.zeros((2, given.y.size))
+    f[0, 2 if confirmed else 5], f[1, 2] = 6.0, 6.0
+    plain, rival = (replace(given, y=given.y + given.F @ one) for one in f)
+    found = s.search(plain, rivals=[(rival, -1e4)])
+    assert found.model[0] == 1
+    assert found.weight @ ~found.chosen[:, 2] < s.DOUBT
+    assert found.named.tolist() == [confirmed and j == 2 for j in range(p)]
+    assert (found.certain[:p] == found.named).all()
+
+
 def test_sets_with_impossible_amounts_are_not_recalled() -> None:
     """The bound of a power is a tenth of what the readings say."""
     given, chosen = problem(1), np.isin(np.arange(10), [9])
