@@ -41,7 +41,7 @@ from gridsec.interface import Frame
 SIZES = (13, 30, 60, 146, 300, 600, 1000, 2000)
 BEFORE, CALM, ATTACK = 40, 60, 6
 """Steps before the measurement, calm steps, and steps after an onset."""
-SEARCHED = 600
+SEARCHED = 1000
 """Largest number of customers with an attack: a search takes the cube of the number."""
 BASE_KVA = 100.0
 
