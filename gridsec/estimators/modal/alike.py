@@ -37,14 +37,13 @@ References
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Self
 
 import numpy as np
 from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, Ints, submatrix
-from gridsec.estimators.modal.costs import SearchProblem, Tableau, among, informed
+from gridsec.estimators.modal.costs import SearchProblem, Tableau, among, common_cost, informed, with_common
 
 HALF = 0.5
 """Share from which on a meter is in the set of the relaxation, and at its start, 1."""
@@ -71,9 +70,9 @@ class Alike(Tableau):
         self.charge = float(problem.charge.max(initial=0.0))
         problem = problem if used is None else among(problem, used)
         meter = np.arange(problem.y.size) < problem.meters
-        self.share, self.w = share, np.where(meter, 1.0 / (problem.std * (1.0 - share)), 0.0)
-        less = replace(problem, std=np.where(meter, np.sqrt(1.0 - share), 1.0) * problem.std)
+        less, self.w = with_common(problem, share)
         super().__init__(less, self.w)
+        self.share = share
         self.own = np.where(meter, 1.0 / (1.0 - share), 0.0)
 
     def copy(self) -> Self:
@@ -90,8 +89,7 @@ class Alike(Tableau):
 
     def _term(self, score: Floats | float, information: Floats | float) -> Floats:
         """Cost of the common amount."""
-        b = np.maximum(information, 0.0)
-        return np.asarray(np.log1p(self.share * b) - score * score / (b + 1.0 / self.share))
+        return common_cost(self.share, score, information)
 
     def _mean(self, score: Floats | float, information: Floats | float) -> Floats:
         """Posterior mean of the common amount."""

@@ -131,11 +131,10 @@ def costs(problem: SearchProblem, sets: Bools, share: float = 0.0) -> Floats:
     """
     meters = np.count_nonzero(sets[:, : problem.meters], axis=1)
     out = penalties(problem.meters)[meters] + (problem.charge.max(initial=0.0) if share else 0.0)
-    problem, sets = among(problem, np.logical_or.reduce(sets, axis=0)), sets[:, sets.any(axis=0)]
-    q, meter = problem.y.size, np.arange(problem.y.size) < problem.meters
-    borders = (np.where(meter, 1.0 / (problem.std * (1.0 - share)), 0.0),) if share else ()
-    problem = replace(problem, std=np.where(meter, np.sqrt(1.0 - share), 1.0) * problem.std)
-    for base, rows, at, inside in _beside(problem, sets, borders):
+    used = np.logical_or.reduce(sets, axis=0)
+    problem, w = with_common(among(problem, used), share)
+    q, borders = problem.y.size, (w,) if share else ()
+    for base, rows, at, inside in _tableaus(problem, sets[:, used], borders):
         log_det, inner = base.block(at, inside)
         sign = np.where(base.chosen[at], -1.0, 1.0) * inside
         out[rows] += base.cost - base.penalty[base.count] + log_det - inner[:, 0, 0]
@@ -143,21 +142,39 @@ def costs(problem: SearchProblem, sets: Bools, share: float = 0.0) -> Floats:
         if share:
             score = inner[:, 0, 1] - base.A[q, q + 1]
             information = meters[rows] / (1.0 - share) + base.A[q + 1, q + 1] - inner[:, 1, 1]
-            information = np.maximum(information, 0.0)
-            out[rows] += np.log1p(share * information) - score * score / (information + 1.0 / share)
+            out[rows] += common_cost(share, score, information)
     return np.asarray(out)
 
 
-def _beside(
+def with_common(problem: SearchProblem, share: float) -> tuple[SearchProblem, Floats]:
+    """The problem without the common part of the variance of its meters, and the row w of that, (q,).
+
+    Parameters
+    ----------
+    problem, share
+        As in `costs`; a share below 1.
+    """
+    meter = np.arange(problem.y.size) < problem.meters
+    less = replace(problem, std=np.where(meter, np.sqrt(1.0 - share), 1.0) * problem.std)
+    return less, np.where(meter, 1.0 / (problem.std * (1.0 - share)), 0.0)
+
+
+def common_cost(share: float, score: Floats | float, information: Floats | float) -> Floats:
+    """Cost of a common amount by its score and information; a share above 0."""
+    b = np.maximum(information, 0.0)
+    return np.asarray(np.log1p(share * b) - score * score / (b + 1.0 / share))
+
+
+def _tableaus(
     problem: SearchProblem, sets: Bools, borders: Sequence[Floats] = ()
 ) -> Iterator[tuple[Tableau, Ints, Ints, Bools]]:
     """Tableaus, rows of sets (k, q) beside their sets, and the faults in which these differ, (j, n).
 
-    One is pivoted on the faults of most sets. Those that differ in more than `APART` are beside the faults
+    One is pivoted on the faults of most sets. Those that differ in more than `TOGGLED` are beside the faults
     that all of them have. n doubles at most from the fewest to the most of the sets that come together.
     """
     most = 2 * np.count_nonzero(sets, axis=0) > len(sets)
-    near = np.count_nonzero(sets ^ most, axis=1) <= APART
+    near = np.count_nonzero(sets ^ most, axis=1) <= TOGGLED
     for which, own in ((near, most), (~near, np.logical_and.reduce(sets[~near], axis=0))):
         if not which.any():
             continue
@@ -187,7 +204,7 @@ def explained(problem: SearchProblem, sets: Bools, weight: Floats, T: Floats) ->
     used = np.logical_or.reduce(sets, axis=0)
     problem, sets, T = among(problem, used), sets[:, used], T[:, used]
     q, mean, variance = problem.y.size, np.zeros((len(sets), len(T))), np.zeros(len(T))
-    for base, rows, at, inside in _beside(problem, sets):
+    for base, rows, at, inside in _tableaus(problem, sets):
         J = np.flatnonzero(base.chosen)
         U = np.where(base.chosen, 0.0, T) - T[:, J] @ base.A[J, :q]
         inverse = np.linalg.inv(base.within(at, inside)) * (inside[:, :, None] & inside[:, None, :])
@@ -254,7 +271,7 @@ def _bordered(A: Floats, v: Floats) -> Floats:
     return np.linalg.cholesky(bordered)
 
 
-APART = 16
+TOGGLED = 16
 """Faults in which a set differs from another one up to which its cost is that of a few toggles, 1."""
 _HUGE = 1e200
 """Above all ``v' A^-1 v``."""

@@ -267,7 +267,8 @@ def corrected(before: Sequence[Estimated], T: Sequence[Floats], found: Identific
     weight = found.weight[counted] / found.weight[counted].sum()
     model, chosen = found.model[counted], found.chosen[counted]
     means, by_amounts = np.empty((weight.size, len(T[0]))), np.zeros(len(T[0]))
-    for k in np.unique(model).tolist():
+    models = np.unique(model).tolist()
+    for k in models:
         of = model == k
         moved, variance = explained(found.problems[k], chosen[of], weight[of], T[k])
         means[of] = before[k].mean + moved
@@ -275,7 +276,7 @@ def corrected(before: Sequence[Estimated], T: Sequence[Floats], found: Identific
     mean = weight @ means
 
     def spread() -> Floats:
-        before_each = sum(weight[model == k].sum() * before[k].variance for k in np.unique(model).tolist())
+        before_each = sum(weight[model == k].sum() * before[k].variance for k in models)
         apart = (means - mean) ** 2
         possible = apart[weight >= DOUBT].max(axis=0)
         return np.asarray(np.maximum(before_each + by_amounts + weight @ apart, POSSIBLE * possible))

@@ -105,8 +105,7 @@ class Identification:
     @property
     def certain(self) -> Bools:
         """Faults without which nothing explains the readings, and that `plain` has, (q,)."""
-        without = self.weight @ ~self.chosen < DOUBT
-        return np.asarray(without if self.plain is None else without & self.plain)
+        return _certain(self.chosen, self.weight, self.plain)
 
 
 def descend(tableau: AnyTableau, groups: Groups = (), met: set[bytes] | None = None) -> AnyTableau:
@@ -513,5 +512,11 @@ def identified(
     chosen = np.stack([np.frombuffer(key, dtype=np.bool_) for _, _, key in every])[kept]
     weight = weight[kept] / weight[kept].sum()
     model = np.array([k for _, k, _ in every])[kept]
-    out = Identification(chosen, model, weight, chosen[0], problems, plain)
-    return replace(out, named=out.certain[: problems[0].meters])
+    named = _certain(chosen, weight, plain)[: problems[0].meters]
+    return Identification(chosen, model, weight, named, problems, plain)
+
+
+def _certain(chosen: Bools, weight: Floats, plain: Bools | None) -> Bools:
+    """Faults that sets of no more than `DOUBT` are without, and that the set `plain` has, (q,)."""
+    without = weight @ ~chosen < DOUBT
+    return np.asarray(without if plain is None else without & plain)
