@@ -1,13 +1,13 @@
 """Average run length of the detector of `modal` to a false alarm, against gamma over several decades.
 
-    python -m benchmarks.run_length [runs] [largest gamma]
+    python -m benchmarks.run_length [runs] [largest gamma] [picture.png]
 
 Honest residuals are drawn from the model of `gridsec.estimators.modal` on a random tree of 12 customers: one
 accuracy class, two classes, and readings that are missing. Each run lasts until log M has passed the largest
 gamma, or `CUT` times as many ticks; a run that is cut counts with the ticks that it lasted. The passages of
 all gammas are taken from the same run, with M evaluated as for the least gamma, which is more often than for
-the others. Cells: mean run length over gamma, and its standard error. Exits 1 where the mean plus 2.33
-standard errors, 99 %, is below gamma.
+the others. Cells: mean run length over gamma, and its standard error; the picture shows the means against
+gamma. Exits 1 where the mean plus 2.33 standard errors, 99 %, is below gamma.
 """
 
 from __future__ import annotations
@@ -71,18 +71,37 @@ def passages(model: ResidualModel, pattern: str, gammas: Floats, seed: int) -> F
     return out
 
 
-def main(runs: int, largest: float) -> int:
+def main(runs: int, largest: float, picture: str) -> int:
     """One table; 1 if a mean run length is below gamma."""
-    gammas, low = 10.0 ** np.arange(1.0, log(largest, 10.0) + 0.25, 0.5), False
+    gammas = 10.0 ** np.arange(1.0, log(largest, 10.0) + 0.25, 0.5)
     head("readings", *(f"{gamma:.0f}" for gamma in gammas))
+    found: dict[str, tuple[Floats, Floats]] = {}
     for name, (model, pattern) in models().items():
         lengths = np.stack([passages(model, pattern, gammas, seed) for seed in range(runs)]) / gammas
         mean, error = lengths.mean(axis=0), lengths.std(axis=0, ddof=1) / np.sqrt(runs)
-        low |= bool((mean + 2.33 * error < 1.0).any())
+        found[name] = mean, error
         row(name, *(f"{a:.1f} ± {b:.1f}" for a, b in zip(mean, error, strict=True)))
-    return int(low)
+    if picture:
+        _draw(picture, gammas, found)
+    return int(any((mean + 2.33 * error < 1.0).any() for mean, error in found.values()))
+
+
+def _draw(picture: str, gammas: Floats, found: dict[str, tuple[Floats, Floats]]) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
+    axes = figure.add_subplot(xscale="log", yscale="log")
+    for (name, (mean, error)), marker in zip(found.items(), "os^v", strict=True):
+        axes.errorbar(gammas, mean * gammas, error * gammas, marker=marker, capsize=2.0, label=name)
+    axes.plot(gammas, gammas, color="black", linestyle="--", label="guarantee: gamma")
+    axes.plot(gammas, CUT * gammas[-1] * np.ones_like(gammas), color="gray", linestyle=":", label="cut")
+    axes.set_xlabel("gamma, ticks")
+    axes.set_ylabel("average run length, ticks")
+    axes.grid(visible=True, which="both", alpha=0.3)
+    axes.legend(fontsize="small")
+    figure.savefig(picture, dpi=110)
 
 
 if __name__ == "__main__":
-    asked = arguments(__doc__, runs=20, gamma=3000.0)
-    sys.exit(main(asked.runs, asked.gamma))
+    asked = arguments(__doc__, runs=20, gamma=3000.0, picture="")
+    sys.exit(main(asked.runs, asked.gamma, asked.picture))

@@ -6,7 +6,6 @@
     identify(core, state, evidence) -> Suspicion                where `alarmed`
     transition(core, state, suspicion) -> CoreState             where the misfit is not settled
     passed(core, state, suspicion) -> (CoreState, Evidence)     where a transition leaves nothing, or None
-    outlasts(core, state, suspicion) -> bool                    where one reading is all there is
     mask(core, state, suspicion) -> (CoreState, Evidence)       where meters are named
     adopt(core, state, suspicion) -> CoreState                  where loads alone explain the readings
     estimate(core, state, suspicion) -> Estimated               where asked for
@@ -737,30 +736,6 @@ def passed(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreStat
     if now.detector.log_m >= CALM * core.limit:
         return None
     return now, evidence
-
-
-def outlasts(core: Core, state: CoreState, suspicion: Suspicion) -> bool:
-    """A search names the same meters after one more tick as the filter expected this one: an honest one.
-
-    Parameters
-    ----------
-    core, state
-        The core, and the state after the tick of the onset.
-    suspicion
-        The explanations after the same tick.
-    """
-    update, made = state.update, core.modes
-    assert update is not None  # noqa: S101  # a search follows a tick
-    _, m, seen, unknown, _ = state.history.readings[-1]
-    nu = update.innovation @ made.back.T
-    if update.exact is not None:
-        nu = np.zeros(made.size)
-        nu[update.exact.rows] = update.exact.half @ update.exact.white
-    after, evidence = step(core, state, state.filter.t + update.gap.h, m - nu, seen, unknown)
-    if not alarmed(core, evidence) or not any_of(after.detector.pinned):
-        return False
-    again = identify(core, after, evidence, suspicion)
-    return bool((again.found.named >= suspicion.found.named).all())
 
 
 def _keeping(before: Suspicion) -> Bools:

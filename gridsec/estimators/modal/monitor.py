@@ -15,12 +15,11 @@ A step, by module:
 
 The residual of a meter is its squared reading less the model; fixed errors are states of the filter.
 Registers err in proportion to v2: with b at 1 pu, ``b (v2 - 1)`` by the mean of b before the tick is no part
-of the residual. A meter is named when a search names it and `CONFIRM` searches in turn have it in their
-likeliest explanations, when one search names it as the only fault with `CONFIRM` readings since the onset, or
-with one that an honest reading after it leaves in force, or when it repeats its readings beyond chance.
-Others of its explanation may delay it (`naming`). Named meters are masked from the onset on, and released by
-their readings (`masking`). The busbar's meter is named by searches in turn. Its phase then counts as not
-metered, until both agree.
+of the residual. A meter is named when a search names it as the only fault, when `CONFIRM` searches in turn
+have it in their likeliest explanations, or when it repeats its readings beyond chance. Others of its
+explanation may delay it (`naming`). Named meters are masked from the onset on, and released by their readings
+(`masking`). The busbar's meter is named by searches in turn. Its phase then counts as not metered, until both
+agree.
 """
 
 from __future__ import annotations
@@ -391,11 +390,7 @@ def _named(
     first = any((each == 1).any() for each in (streak[named], phases, inverters))
     wait = 1 if first else max(1, age // LOOKS)
     after = replace(state, streak=streak, phases=phases, inverters=inverters, due=tick + wait)
-    since = () if any_of(masked) else state.core.history.readings[-age:]
-    sure = final(suspicion.found, named, streak, since, kernel.near.laterals)
-    sole = age == 1 and any_of(named) and np.count_nonzero(suspicion.found.chosen[0]) == 1
-    if sole and not any_of(masked) and core.outlasts(kernel, state.core, suspicion):
-        sure = named
+    sure = final(suspicion.found, named, streak, any_of(masked), kernel.near.laterals)
     if suspicion.fits and not any_of(sure):
         # Masked meters alone may have been manipulated before they were masked.
         sure = alone(suspicion.found, masked)

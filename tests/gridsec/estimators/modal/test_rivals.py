@@ -156,24 +156,6 @@ def test_a_transition_that_ends_too_early_names_nothing(seed: int) -> None:
     assert settled == [True, False, False, False, True, True, True, True]
 
 
-@pytest.mark.parametrize(("amount", "stays"), [(0.008, False), (0.04, True)])
-def test_a_name_by_one_reading_is_tried_with_an_honest_next_one(amount: float, stays: bool) -> None:
-    """Both amounts name the meter at their first reading; an honest one leaves the name of the larger."""
-    kernel = core.assemble(MODEL, STEPS_OF_PLACES, np.full(12, 0.1), gamma=1e6)
-    for seed in range(3):
-        source, state = Source(MODEL, np.random.default_rng(seed)), core.init(kernel, 0.0)
-        for k in range(201):
-            state, evidence = core.step(
-                kernel, state, float(k), source.tick() + amount * (k == 200) * np.eye(12)[4]
-            )
-        suspicion = core.identify(kernel, state, evidence)
-        assert np.flatnonzero(suspicion.found.named).tolist() == [4]
-        assert core.outlasts(kernel, state, suspicion) is stays
-        state, evidence = core.step(kernel, state, 201.0, source.tick())
-        named = core.identify(kernel, state, evidence, suspicion).found.named
-        assert bool(named[4] and evidence.log_m >= kernel.limit) is stays
-
-
 def until_passed(
     kernel: core.Core, manipulated: Floats, seed: int
 ) -> tuple[int, core.CoreState, tuple[core.CoreState, Evidence] | None]:
