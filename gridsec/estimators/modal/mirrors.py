@@ -74,16 +74,15 @@ def neighbourhoods(modes: Modes, most: int, customers: Ints | None = None) -> Ne
 
 def reflected(found: Identification, near: Neighbourhoods) -> Identification:
     """Explanations with the mirror images of those that weigh at least `REFLECTED`."""
-    found_by = costs_of(found)
+    found_by, likelier = costs_of(found), False
     for k in np.flatnonzero(found.weight >= REFLECTED).tolist():
         cost = found_by[int(found.model[k])]
         own = cost[found.chosen[k].tobytes()]
         for image, more in _images(found.problems[int(found.model[k])], found.chosen[k], near):
             key = image.tobytes()
-            cost[key] = min(own + more, cost.get(key, np.inf))
-    if sum(map(len, found_by)) == len(found.weight):
-        return found
-    return identified(found.problems, found_by, found.plain)
+            if own + more < cost.get(key, np.inf):
+                cost[key], likelier = own + more, True
+    return identified(found.problems, found_by, found.plain) if likelier else found
 
 
 def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iterator[tuple[Bools, float]]:

@@ -12,7 +12,7 @@ from gridsec.arrays import Bools, Floats
 from gridsec.estimators.modal import core, mirrors
 from gridsec.estimators.modal.core import Core
 from gridsec.estimators.modal.costs import SearchProblem
-from gridsec.estimators.modal.search import Identification
+from gridsec.estimators.modal.search import Identification, identified
 from tests.gridsec.estimators.modal.test_search import problem
 
 FEEDER = tree(12, np.random.default_rng(3))
@@ -153,3 +153,18 @@ def test_explanations_without_mirror_images_stay() -> None:
     chosen[0, 14] = True
     alone = replace(given, chosen=chosen, model=np.zeros(1, dtype=np.intp), weight=np.ones(1))
     assert mirrors.reflected(alone, of.near) is alone
+
+
+def test_a_mirror_image_that_was_found_with_its_own_penalty_has_that_of_its_set() -> None:
+    """All meters of the phase alike are the busbar's meter, with or without them among the sets before."""
+    of = kernel(12)
+    given = looked(of, np.full(12, 0.04))
+    p = given.chosen.shape[1]
+    busbar, meters = np.arange(p) == p - 1, np.arange(p) < 12
+    sets = {busbar.tobytes(): 0.0, meters.tobytes(): -2.0 * float(np.log(1e-3))}
+    alone = identified(given.problems, ({busbar.tobytes(): 0.0}, *({} for _ in given.problems[1:])))
+    both = identified(given.problems, (sets, *({} for _ in given.problems[1:])))
+    for each in (alone, both):
+        found = mirrors.reflected(each, of.near)
+        assert np.isclose(found.weight[(found.chosen == meters).all(axis=1)].sum(), found.weight[0])
+        assert not found.certain[-1]
