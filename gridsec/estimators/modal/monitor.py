@@ -882,6 +882,12 @@ def observed(design: ModalDesign, state: ModalState) -> ObserverRecord | None:
 
 
 def resume(design: ModalDesign, state: ModalState, before: ObserverRecord) -> ModalState:
-    """State from `init` with the observer of an earlier run, that of the front end."""
+    """State from `init` with the observer of an earlier run, that of the front end.
+
+    The injections have the errors of a pause: voltages stay between those at both ends of it.
+    """
     front = front_state.resume(design.front, state.front, before)
-    return state if front is state.front else replace(state, front=front)
+    if front is state.front:
+        return state
+    error = front.injection_error
+    return replace(state, front=front, injections=replace(error, width=0.0 * error.width))
