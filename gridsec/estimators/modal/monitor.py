@@ -680,6 +680,9 @@ def _checked_inverters(
     if before.idle and not any_of(measured.reports_q):
         return before
     residual, std = verdict.deviations(design.core, state.core, tick.m)
+    known = np.where(before.named(front), tick.predicted.injection_error.error, tick.injections.error)
+    free = front.inverters_of(~now.trust.trusted)
+    others = partial(doubts.unknown, front, measured, now.uncertainty, known, free, now.clock_skew)
     return check_inverters(
         front,
         before,
@@ -693,6 +696,7 @@ def _checked_inverters(
             residual,
             std,
             partial(verdict.share, front, design.core, state.core),
+            partial(verdict.unreported, front, design.core, state.core, tick.m, others, before.sure),
         ),
     )
 
