@@ -17,7 +17,8 @@ The residual of a meter is its squared reading less the model; fixed errors are 
 Registers err in proportion to v2: with b at 1 pu, ``b (v2 - 1)`` by the mean of b before the tick is no part
 of the residual. A meter is named when a search names it and `CONFIRM` searches in turn have it in their
 likeliest explanations, when one search names it as the only fault with `CONFIRM` readings since the onset, or
-with one that an honest reading after it leaves in force, or when it repeats its readings beyond chance.
+with one that an honest reading after it leaves in force, or when it repeats its readings beyond chance or
+reads what is no voltage.
 Others of its explanation may delay it (`naming`). Named meters are masked from the onset on, and released by
 their readings (`masking`). The busbar's meter is named by searches in turn. Its phase then counts as not
 metered, until both agree.
@@ -48,6 +49,7 @@ from gridsec.estimators.front.device_checks import (
 from gridsec.estimators.front.measurements import (
     Measurements,
     checked,
+    impossible,
     measurements,
     plausible,
     update_skew,
@@ -261,6 +263,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     repeated = front_state.repeated(front, given, frame)
     if repeated is not None:
         return state, *repeated
+    wild, frame = impossible(front, frame, given.trust.named)
     history, frame = without_shifted_busbar(
         front, given.busbar_history, plausible(front, frame), given.trust.trusted, given.v0_squared
     )
@@ -274,10 +277,8 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     )
     h, free = frame.t - given.t, front.inverters_of(~given.trust.trusted)
     injections = drive.followed(front, state.injections, given, predicted, free, h)
-    held = state.held
-    if given.trust.trusted is not trusted or any_of(held):
-        jumps = trusted & ~given.trust.trusted
-        held = np.where(jumps, HELD, np.maximum(held - measured.available, 0))
+    jumps = (trusted & ~given.trust.trusted) | (wild & ~measured.available)
+    held = np.where(jumps, HELD, np.maximum(state.held - measured.available, 0))
     v2 = predicted.v2_bus[front.prior.meters]
     last = None
     # A power that comes back is no step of the voltage.
@@ -307,7 +308,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     kernel = _begun_anew(design, state, frame.t) if open_ is None and whole else state.core
     kernel, evidence = core.step(
         design.core,
-        _repeating(kernel, repeat_lags(kinds) > 0),
+        _without(kernel, (repeat_lags(kinds) > 0) | (wild & measured.available)),
         frame.t,
         m,
         None if whole else seen,
@@ -347,8 +348,8 @@ def _begun_anew(design: ModalDesign, state: ModalState, t: float) -> CoreState:
     return _begun(design.core, state.kept, t)
 
 
-def _repeating(state: CoreState, which: Bools) -> CoreState:
-    """Core with the meters masked that repeat their readings, (p,); their release begins anew."""
+def _without(state: CoreState, which: Bools) -> CoreState:
+    """Core with meters masked by their readings alone, (p,); their release begins anew."""
     return replace(state, masked=masking.added(state.masked, which)) if any_of(which) else state
 
 
