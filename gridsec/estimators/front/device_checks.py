@@ -202,6 +202,7 @@ class ReportedPowers:
     residual: Floats  # (p,) residuals by the other readings, squared pu
     std: Floats  # (p,) their standard deviations, squared pu
     share: Share  # evidence of the voltages
+    unreported: Unreported  # the same of this tick, for an inverter without a report
 
 
 Share = Callable[[int, float, bool], tuple[float, float]]
@@ -209,6 +210,10 @@ Share = Callable[[int, float, bool], tuple[float, float]]
 
 Results: probability that the report is true and the inverter wrong, for even prior odds; standard deviations
 by which the voltages deviate along the inverter's column if the inverter is right."""
+Unreported = Callable[[int, float], tuple[float, float]]
+"""Evidence of the voltages of one tick on an inverter without a report, by meter and last amount, pu.
+
+Results as in `Share`."""
 
 
 def check_inverters(design: FrontDesign, before: InverterChecks, now: ReportedPowers) -> InverterChecks:
@@ -230,20 +235,25 @@ def check_inverters(design: FrontDesign, before: InverterChecks, now: ReportedPo
         asked, np.clip(before.count + np.where(disagrees, _DISAGREEMENT, -1), 0, _MAX_COUNT), before.count
     )
     lasts = (count >= _EVIDENCE) | (before.off & (count > 0))
-    share, beyond = np.zeros(at.size), before.sure.copy()
-    amount = np.where(asked, amount, before.amount) * lasts
+    share, beyond = before.share.copy(), before.sure.copy()
+    amount = np.where(asked, amount, before.amount)
+    unlikely = 1.0 / design.options.like
     for j in np.flatnonzero(lasts).tolist():
-        uses_q = bool(asked[j] and now.uses_q[at[j]])
-        share[j], sigmas = now.share(j, float(amount[j]), uses_q)
-        beyond[j] |= bool(asked[j] and sigmas > design.sigmas)
-    # Without reports the accusation stays until the voltages contradict it.
-    over = lasts & ~asked & (share <= 1.0 / design.options.like)
-    count = np.where(over, count - 1, count)
-    share = np.where(asked | over, share, before.share * lasts)
-    sure = lasts & beyond & ((share >= 1.0 - 1.0 / design.options.like) | (before.sure & (share >= 0.5)))
+        if asked[j]:
+            share[j], sigmas = now.share(j, float(amount[j]), bool(now.uses_q[at[j]]))
+            beyond[j] |= bool(sigmas > design.sigmas)
+            continue
+        # Without reports the accusation stays until the voltages contradict it, tick by tick.
+        still, sigmas = now.unreported(j, float(amount[j]))
+        if still <= unlikely and sigmas <= design.sigmas:
+            count[j] -= 1
+        elif still >= 1.0 - unlikely:
+            count[j] = min(count[j] + _DISAGREEMENT, _MAX_COUNT)
+    lasts &= count > 0
+    sure = lasts & beyond & ((share >= 1.0 - unlikely) | (before.sure & (share >= 0.5)))
     least, most = (of[at] for of in droop.saturated(size))
     enough = asked & (room < np.maximum(most - x, x - least))
-    return InverterChecks(count, lasts, amount, share, sure, design.inverters_of(enough))
+    return InverterChecks(count, lasts, amount * lasts, share * lasts, sure, design.inverters_of(enough))
 
 
 def probability(worse: float) -> float:

@@ -56,6 +56,19 @@ class Measurements:
     busbar_available: Bools  # (b,) the busbar's meter has a plausible reading
 
 
+def impossible(design: FrontDesign, frame: Frame, named: Bools) -> tuple[Bools, Frame]:
+    """Meters with a reading outside `v2_limits`, (p,), which no load causes, and the frame to use.
+
+    It lacks these readings where their meters and those `named` (p,) are more than the promised number: then
+    the feeder has failed, and no meter is false.
+    """
+    low, high = design.options.v2_limits
+    out = np.asarray(frame.seen & np.isfinite(frame.y) & ((frame.y < low) | (frame.y > high)))
+    if any_of(out) and np.count_nonzero(out | named) > design.max_attacked:
+        frame = replace(frame, seen=frame.seen & ~out)
+    return out, frame
+
+
 def plausible(design: FrontDesign, frame: Frame) -> Frame:
     """Frame with physically possible powers; no readings at clock offsets beyond `largest_offset`."""
     far = unusable_offsets(design, frame.clock_offset)

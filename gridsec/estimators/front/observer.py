@@ -48,8 +48,11 @@ _PATIENT = replace(POLICY, settled=0.0)
 _LATE = 1.5
 """Ticks after the last frame from which on the voltages may have moved unseen."""
 
-_RESPONSES = 4
-"""Iterations for the inverters' response in a pause; each divides the excess by the loop gain."""
+_RESPONSES = 16
+"""Iterations for the inverters' response in a pause; each divides the excess by the loop gain.
+
+With 4 the rest was larger than the response of a calm pause, and left the verdict open.
+"""
 
 
 def predict(design: FrontDesign, state: FrontState, measured: Measurements, sizes: Floats) -> Prediction:

@@ -182,14 +182,14 @@ def followed(  # noqa: PLR0917  # the state, and one frame
         Interval, s.
     """
     own, width = now.injection_error, now.injection_error.width
-    if not front.meter_of.size or given.last is None:
+    if not front.meter_of.size:
         return own
-    follow, checks = any_of(free), given.inverter_checks
-    if before is given.injection_error and checks.idle and not follow:
+    last, checks = given.last if any_of(free) else None, given.inverter_checks
+    if before is given.injection_error and checks.idle and last is None:
         # No inverter has followed the estimate so far: the errors are those of the front end.
         return own
-    if follow:
-        width = np.where(free, sqrt(3.0) * given.last[0].std[front.plant.droop.customer], width)
+    if last is not None:
+        width = np.where(free, sqrt(3.0) * last[0].std[front.plant.droop.customer], width)
     target = injection_target(front, before, own.input, width)
     errors = relaxed(front, before, own.input, width, target, h)
     # The voltages have decided that this inverter leaves its curve: its injection says nothing about others.

@@ -16,10 +16,10 @@ A step, by module:
 The residual of a meter is its squared reading less the model; fixed errors are states of the filter.
 Registers err in proportion to v2: with b at 1 pu, ``b (v2 - 1)`` by the mean of b before the tick is no part
 of the residual. A meter is named when a search names it as the only fault, when `CONFIRM` searches in turn
-have it in their likeliest explanations, or when it repeats its readings beyond chance. Others of its
-explanation may delay it (`naming`). Named meters are masked from the onset on, and released by their readings
-(`masking`). The busbar's meter is named by searches in turn. Its phase then counts as not metered, until both
-agree.
+have it in their likeliest explanations, when it repeats its readings beyond chance, or when it reads what is
+no voltage. Others of its explanation may delay it (`naming`). Named meters are masked from the onset on, and
+released by their readings (`masking`). The busbar's meter is named by searches in turn. Its phase then counts
+as not metered, until both agree.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ from gridsec.estimators.front.device_checks import (
 from gridsec.estimators.front.measurements import (
     Measurements,
     checked,
+    impossible,
     measurements,
     plausible,
     update_skew,
@@ -260,6 +261,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     repeated = front_state.repeated(front, given, frame)
     if repeated is not None:
         return state, *repeated
+    wild, frame = impossible(front, frame, given.trust.named)
     history, frame = without_shifted_busbar(
         front, given.busbar_history, plausible(front, frame), given.trust.trusted, given.v0_squared
     )
@@ -273,10 +275,8 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     )
     h, free = frame.t - given.t, front.inverters_of(~given.trust.trusted)
     injections = drive.followed(front, state.injections, given, predicted, free, h)
-    held = state.held
-    if given.trust.trusted is not trusted or any_of(held):
-        jumps = trusted & ~given.trust.trusted
-        held = np.where(jumps, HELD, np.maximum(held - measured.available, 0))
+    jumps = (trusted & ~given.trust.trusted) | (wild & ~measured.available)
+    held = np.where(jumps, HELD, np.maximum(state.held - measured.available, 0))
     v2 = predicted.v2_bus[front.prior.meters]
     last = None
     # A power that comes back is no step of the voltage.
@@ -306,7 +306,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     kernel = _begun_anew(design, state, frame.t) if open_ is None and whole else state.core
     kernel, evidence = core.step(
         design.core,
-        _repeating(kernel, repeat_lags(kinds) > 0),
+        _without(kernel, (repeat_lags(kinds) > 0) | (wild & measured.available)),
         frame.t,
         m,
         None if whole else seen,
@@ -346,8 +346,8 @@ def _begun_anew(design: ModalDesign, state: ModalState, t: float) -> CoreState:
     return _begun(design.core, state.kept, t)
 
 
-def _repeating(state: CoreState, which: Bools) -> CoreState:
-    """Core with the meters masked that repeat their readings, (p,); their release begins anew."""
+def _without(state: CoreState, which: Bools) -> CoreState:
+    """Core with meters masked by their readings alone, (p,); their release begins anew."""
     return replace(state, masked=masking.added(state.masked, which)) if any_of(which) else state
 
 
@@ -675,6 +675,9 @@ def _checked_inverters(
     if before.idle and not any_of(measured.reports_q):
         return before
     residual, std = verdict.deviations(design.core, state.core, tick.m)
+    known = np.where(before.named(front), tick.predicted.injection_error.error, tick.injections.error)
+    free = front.inverters_of(~now.trust.trusted)
+    others = partial(doubts.unknown, front, measured, now.uncertainty, known, free, now.clock_skew)
     return check_inverters(
         front,
         before,
@@ -688,6 +691,7 @@ def _checked_inverters(
             residual,
             std,
             partial(verdict.share, front, design.core, state.core),
+            partial(verdict.unreported, front, design.core, state.core, tick.m, others, before.sure),
         ),
     )
 
@@ -877,6 +881,12 @@ def observed(design: ModalDesign, state: ModalState) -> ObserverRecord | None:
 
 
 def resume(design: ModalDesign, state: ModalState, before: ObserverRecord) -> ModalState:
-    """State from `init` with the observer of an earlier run, that of the front end."""
+    """State from `init` with the observer of an earlier run, that of the front end.
+
+    The injections have the errors of a pause: voltages stay between those at both ends of it.
+    """
     front = front_state.resume(design.front, state.front, before)
-    return state if front is state.front else replace(state, front=front)
+    if front is state.front:
+        return state
+    error = front.injection_error
+    return replace(state, front=front, injections=replace(error, width=0.0 * error.width))

@@ -19,13 +19,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from math import inf, log
+from math import inf, log, sqrt
 from typing import Any
 
 import numpy as np
-from scipy.linalg import lapack
+from scipy.linalg import cho_factor, cho_solve, lapack
 
-from gridsec.arrays import PENDING, Bools, Floats, all_of, any_of, deferred, indices
+from gridsec.arrays import PENDING, Bools, Floats, all_of, any_of, deferred, indices, submatrix
 from gridsec.estimators.detection import AGREEMENT, DecisionInputs, decide
 from gridsec.estimators.front.design import FrontDesign
 from gridsec.estimators.front.device_checks import probability
@@ -40,12 +40,12 @@ from gridsec.estimators.front.output import (
     unvouched,
     with_clock_offsets,
 )
-from gridsec.estimators.modal import detector, masking, signatures
+from gridsec.estimators.modal import detector, full, masking, signatures
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.costs import amounts
 from gridsec.estimators.modal.detector import SIZE, WEIGHTS, Evidence, Tick
-from gridsec.estimators.modal.doubts import skewed
+from gridsec.estimators.modal.doubts import Unknown, skewed
 from gridsec.estimators.modal.filter import Interval
 from gridsec.estimators.modal.signatures import Onsets
 from gridsec.estimators.modal.static import Static
@@ -373,9 +373,7 @@ def share(  # noqa: PLR0917  # the core, and one report
     Without it, a true report is a fault of a. The onset that suits the fault best decides. Where readings are
     missing, the information counts with the share of it that was read at this tick.
     """
-    inverter = int(np.argmax(design.meter_of == j))
-    at = core.modes.size + design.customers + inverter
-    W, onsets = core.faults.W[:, [at]], detector.followed(core.modes, state.detector).onsets
+    W, onsets = _column(design, core, j), detector.followed(core.modes, state.detector).onsets
     rows = np.flatnonzero(onsets.used & ~onsets.ramp)
     now = signatures.scores(core.modes, onsets, state.static, rows)
     y, F = now.of(W, W * W)
@@ -393,6 +391,51 @@ def share(  # noqa: PLR0917  # the core, and one report
     rest = y[best, 0] - fault * F[best, 0] if uses_q else y[best, 0]
     sigmas = float(abs(rest) / np.sqrt(max(F[best, 0], _TINY)))
     return probability(float(-gain[best] if uses_q else gain[best])), sigmas
+
+
+def unreported(  # noqa: PLR0917  # the core, and one inverter
+    design: FrontDesign,
+    core: Core,
+    state: CoreState,
+    m: Floats,
+    others: Callable[[], Unknown | None],
+    sure: Bools,
+    j: int,
+    a: float,
+) -> tuple[float, float]:
+    """Evidence of the voltages of one tick on the inverter of meter j, `a` beyond its curve, pu, as `Share`.
+
+    The filter does not learn the injection of a named inverter. With the covariance V of the residuals u less
+    their means, without that injection, and its column c, twice the logarithm of the ratio of likelihoods is
+    ``2 a c' V^-1 u - a^2 c' V^-1 c``. It learns that of another: while an onset is suspected, its voltages
+    say nothing.
+
+    Parameters
+    ----------
+    m : (p,)
+        Residuals.
+    others
+        Directions that the frame leaves unknown where the named inverters follow their curves.
+    sure : (p,)
+        Meters of named inverters.
+    """
+    whole = state.filter.full or full.expanded(core.modes, state.filter, state.static)
+    n = indices(whole.seen)
+    if not n.size or (any_of(state.detector.pinned) and not sure[j]):
+        return 0.5, 0.0
+    u, c = (m - whole.mean[0] - whole.mean[1])[n], core.modes.back[n] @ _column(design, core, j)[:, 0]
+    V, unknown = submatrix(core.modes.noise + whole.whole, n, n), others()
+    if unknown is not None:
+        V = V + unknown.wide[n] @ unknown.wide[n].T
+    felt = cho_solve(cho_factor(V), c)
+    y, F = float(felt @ u), max(float(felt @ c), _TINY)
+    return probability(2.0 * a * y - a * a * F), abs(y) / sqrt(F)
+
+
+def _column(design: FrontDesign, core: Core, j: int) -> Floats:
+    """Column of the inverter of meter j in the modes, (t, 1)."""
+    inverter = int(np.argmax(design.meter_of == j))
+    return core.faults.W[:, [core.modes.size + design.customers + inverter]]
 
 
 _TINY = float(np.finfo(np.float64).tiny)

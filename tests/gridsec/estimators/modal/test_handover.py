@@ -63,10 +63,7 @@ def test_the_transient_decays_with_the_certificate() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    "seed",
-    [0, 1, pytest.param(2, marks=pytest.mark.xfail(reason="the verdict of `modal` is open at once")), 3],
-)
+@pytest.mark.parametrize("seed", range(4))
 def test_a_restart_without_a_gap_continues_the_observer(seed: int) -> None:
     """Injections as without a restart; a fresh start is an order of magnitude further away."""
     design, street, state = settled(seed, 2.0)
@@ -129,6 +126,8 @@ def test_the_transient_contains_what_happened_in_a_pause(seed: int, gap_s: float
     """Loads jump at some moment of the pause, and the inverters respond."""
     design, street, state = settled(seed, 2.0)
     street.wobble, before = 0.0, state.front.x
+    # Loads hold until they jump: by a drift, voltages would leave the range between both ends.
+    street.usual, street.level = street.p, 0.0 * street.level
     assert before is not None
     plant = design.plant
     # Inverters that are still off the observer would move the voltages before the jump.
@@ -151,7 +150,6 @@ def test_the_transient_contains_what_happened_in_a_pause(seed: int, gap_s: float
         assert verdict.decision is not Decision.CLEAN
 
 
-@pytest.mark.xfail(reason="`modal` settles after a calm pause of 4 s too")
 def test_a_calm_pause_ends_with_a_verdict_and_a_moved_one_settles() -> None:
     design, street, state = settled(3, 2.0)
     street.wobble, kept = 0.0, record(design, state)

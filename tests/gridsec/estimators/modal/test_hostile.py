@@ -68,6 +68,23 @@ class TestNumbersThatAreNone:
         assert not any(np.delete(verdict.suspects, 2).any() for verdict in verdicts)
         assert verdicts[-1].decision is Decision.CLEAN
 
+    @pytest.mark.parametrize("value", [-1.0, 0.2, 1e300])
+    def test_meters_that_read_no_voltage_once_are_named_at_once(self, value: float) -> None:
+        """Of more than the promised number none is named: the feeder has failed."""
+        for meters in ([2, 5, 7], [0, 2, 5, 7, 8]):
+
+            def change(frame: Frame, meters: list[int] = meters) -> Frame:
+                y = frame.y.copy()
+                y[meters] = value
+                return replace(frame, y=y)
+
+            verdicts, _ = run(change, frames=1, after=70)
+            few = len(meters) == 3
+            assert list(np.flatnonzero(verdicts[0].suspects)) == (meters if few else [])
+            assert verdicts[0].decision is (Decision.ATTACKED if few else Decision.UNDECIDED)
+            assert not any(np.delete(verdict.suspects, meters).any() for verdict in verdicts)
+            assert verdicts[-1].decision is Decision.CLEAN
+
     @pytest.mark.canary("0")
     @pytest.mark.parametrize("inverters", [0, 5])
     def test_everything_at_once(self, inverters: int) -> None:

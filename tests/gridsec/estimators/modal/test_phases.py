@@ -99,6 +99,7 @@ def side_by_side(
     silent: tuple[tuple[int, ...], ...] = ((), (), ()),
     count: int = 30,
     *,
+    onset: int = 10,
     meshed: bool = False,
 ) -> tuple[list[tuple[Estimate, Verdict]], tuple[Estimate, Verdict], ModalDesign]:
     """The last answers of a balanced monitor for each phase, and of one for all three."""
@@ -114,10 +115,10 @@ def side_by_side(
     answers: list[tuple[Estimate, Verdict]] = []
     state = monitor.init(whole, 1000.0)
     for tick in range(count):
-        told = lies if tick >= 10 else ({}, {}, {})
+        told, lost = (lies, silent) if tick >= onset else (({},) * 3, ((),) * 3)
         for street in streets:
             street.advance(1.0)
-        heard = [street.frame(told[k], silent[k] if tick >= 10 else ()) for k, street in enumerate(streets)]
+        heard = [street.frame(told[k], lost[k]) for k, street in enumerate(streets)]
         stepped = [monitor.step(alone, before, frame) for before, frame in zip(states, heard, strict=True)]
         states, answers = [each[0] for each in stepped], [each[1:] for each in stepped]
         state, estimate, verdict = monitor.step(whole, state, together(heard))
@@ -173,11 +174,18 @@ class TestPhasesThatDoNotTouch:
         wanted = Decision.ATTACKED if verdict.suspects.any() else Decision.CLEAN
         assert verdict.decision is wanted
 
-    @pytest.mark.xfail(reason="`modal` states up to 15 % less deviation there in three phases")
     def test_a_silent_meter_is_missed_in_its_phase_only(self) -> None:
-        alone, (estimate, _), _ = side_by_side(({}, {}, {}), ((), (4,), ()))
+        # The observers settle after 11 ticks.
+        alone, (estimate, _), _ = side_by_side(({}, {}, {}), ((), (4,), ()), onset=20)
         expected = np.concatenate([each.std for each, _ in alone])
         np.testing.assert_allclose(estimate.std, expected, rtol=0, atol=2e-9)
+
+    def test_a_meter_that_is_silent_while_the_observers_settle_takes_nothing_from_other_phases(self) -> None:
+        """Monitors with complete readings give the ticks of settling up; that of all phases keeps them."""
+        alone, (estimate, _), _ = side_by_side(({}, {}, {}), ((), (4,), ()), onset=10)
+        expected, std = np.array([each.std for each, _ in alone]), estimate.std.reshape(3, CUSTOMERS)
+        np.testing.assert_allclose(std[1], expected[1], rtol=0, atol=2e-9)
+        assert (std <= expected + 2e-9).all()
 
 
 def spread_evenly(name: str, kw: float) -> tuple[Site, Site]:
@@ -310,12 +318,11 @@ class TestTheEuropeanFeeder:
             assert verdict.decision is not Decision.CLEAN
 
     @pytest.mark.acceptance
-    @pytest.mark.xfail(reason="`modal` names none of the absurd readings, and stays UNDECIDED")
     def test_absurd_frames_get_an_answer(self) -> None:
         this = self.trial(None, 32.0)
         watcher = design(this.stated)
         rng, absurd = np.random.default_rng(8), np.array([np.nan, np.inf, -np.inf, -1.0, 0.0, 1e300, 1.0])
-        state, answers = watcher.init(0.0), []
+        state, answers, false = watcher.init(0.0), [], np.zeros(55, dtype=np.bool_)
         for tick, (frame, _) in enumerate(frames(this)):
             broken = {
                 name: np.where(
@@ -328,9 +335,12 @@ class TestTheEuropeanFeeder:
             assert np.isfinite(estimate.v2).all()
             assert np.isfinite(estimate.std).all()
             answers.append(verdict.decision)
+            false |= np.isfinite(heard.y) & (heard.y != frame.y)
+            assert not verdict.suspects[~false].any()
         # Nobody can call a feeder clean of which every fifth voltage is no voltage.
         assert answers[19] is Decision.CLEAN
-        assert set(answers[20:]) == {Decision.UNDECIDED, Decision.ATTACKED}
+        assert Decision.CLEAN not in answers[20:]
+        assert Decision.ATTACKED in answers[20:]
         # The same frame again is not used.
         _, _, verdict = watcher.step(state, frame)
         assert verdict.decision is Decision.UNDECIDED
