@@ -11,7 +11,8 @@ with L(J') and L_one(J) of one amount for the exchanged meters. So readings alon
 the mean of the likelihoods with independent amounts V and with amounts alike, as in `search`, for all sets.
 
 **Laterals.** ``J' = J xor g``, with and without the false powers of J, for every group of neighbours but the
-whole feeder. A majority of a lateral that agrees is believed only as far as others confirm it.
+whole feeder, and for all others where J' has no more meters than are promised. A majority of a lateral that
+agrees is believed only as far as others confirm it.
 
 **Phases.** A phase of the busbar off by x, with meters A of the phase off by -x, has the same residuals as
 the other meters of the phase off by -x: L is the same. The promise "at most M manipulated meters" excludes
@@ -101,7 +102,10 @@ def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iter
                 more = float(both[1] - both[0] + problem.charge[image].sum() - problem.charge[chosen].sum())
             yield image, max(more, 0.0) + _apart(likelihood, chosen & image, column)
     done = set[bytes]()
-    for lateral in near.laterals & read:
+    # What lies outside of a lateral is one, too: that of more meters than are promised has no image.
+    outside = ~near.laterals & read
+    few = np.count_nonzero(outside ^ chosen[:p], axis=1) <= near.most
+    for lateral in np.vstack([near.laterals & read, outside[few]]):
         accused, others = lateral & chosen[:p], lateral & ~chosen[:p]
         key = others.tobytes() + accused.tobytes()
         if key in done or not any_of(accused) or not any_of(others):

@@ -168,3 +168,13 @@ def test_a_mirror_image_that_was_found_with_its_own_penalty_has_that_of_its_set(
         found = mirrors.reflected(each, of.near)
         assert np.isclose(found.weight[(found.chosen == meters).all(axis=1)].sum(), found.weight[0])
         assert not found.certain[-1]
+
+
+@pytest.mark.parametrize("most", [2, 3])
+def test_all_others_of_a_lateral_have_an_image_within_the_promise(most: int) -> None:
+    """Meter 4 of the meters 4 to 7, which belong to two branches; the others are one lateral."""
+    given = problem(3, p=8, others=1)
+    laterals = (np.arange(8) < 4)[None]
+    near = mirrors.Neighbourhoods(laterals, np.zeros((8, 1), dtype=np.bool_), most, 8 + np.arange(8))
+    images = [np.flatnonzero(one).tolist() for one, _ in mirrors._images(given, np.arange(9) == 4, near)]
+    assert images == ([[5, 6, 7]] if most == 3 else [])
