@@ -23,11 +23,6 @@ names none.
 with the most of C, but not all, splits it. Both parts are checked by themselves, and split again up to
 `SPLITS` times: honest meters that seem off together are neighbours.
 
-**False powers.** A coalition of customers that also report false powers can imitate a false power elsewhere
-beside an honest meter. Where J has faults that are no meters, customers with a false reading and a false
-power each, without a charge, are looked for in place of C and of these faults, the busbar and inverters
-included. The customer with possible amounts that lowers L most is added until none lowers it.
-
 **Search of g.** Given the amounts of the rest J - C, g has the information F and the scores y. One amount x
 has the relaxation
 
@@ -36,18 +31,15 @@ has the relaxation
 which is convex (`alike.bounded_minimum`). With any amounts of the sign, and independent ones of the rest, it
 is a minimum over z >= 0 of all usable meters, ``z' F z / 2 - z' y``, a bound. Where that is above the limit
 of a naming, the meters with the largest z are the only g. Elsewhere the relaxation's solution orders the
-meters. The best beginning of this order is improved by single meters and by exchanges, and so are the best of
-the laterals and of such sets of earlier searches. x is first the mean amount of C, then that of the set
-found. Where that gains nothing and the solution has more meters than the promise, x is larger. Where the best
-g has meters of C, the best one without them is also found. g is also looked for in place of the rest's meters
-of its own sign, since colluding meters may share one amount, and of its faults that are no meters.
+meters, and the best beginning of this order is improved by single meters and by exchanges. x is first the
+mean amount of C, then that of the set found. Where that gains nothing and the solution has more meters than
+the promise, x is larger. Where the best g has meters of C, the best one without them is also found.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import chain
 from math import inf, log
 from typing import Self
 
@@ -81,8 +73,6 @@ _COUNTS = -2.0 * log(2.0 * DOUBT)
 """Largest cost of a set that contests a name: twice the weight from which on a set counts in the variance."""
 OPEN = 2.0
 """Share that a true set leaves open, in that of the set that suits the readings best, 1."""
-STARTS = 4
-"""Sets of earlier searches and laterals that are improved besides those of the relaxation, 1."""
 ALIKE_LESS = 3.0
 """Amount by which L with amounts alike may be below the bound of independent ones, 1: 2 log 2, and more."""
 
@@ -111,7 +101,6 @@ def weighed(
     masked: Bools,
     near: Neighbourhoods,
     left: float = inf,
-    known: Sequence[Bools] = (),
 ) -> Weighed:
     """Explanations with sets of meters that may replace accused ones.
 
@@ -125,8 +114,6 @@ def weighed(
         Laterals, and the largest number of manipulated meters that is promised.
     left
         Share of the misfit that the likeliest explanation leaves.
-    known : (q,) each
-        Such sets of earlier searches.
     """
     p, J = found.named.size, found.chosen[0]
     first = J.size - near.phases.shape[1]
@@ -147,8 +134,7 @@ def weighed(
     fresh[:p] &= ~masked
     sets = [fresh & (sign * amount > 0.0) for sign in _SIGNS]
     sets += [np.arange(J.size) == k for k in np.flatnonzero(J[first:]) + first]
-    begun = np.vstack([near.laterals, *(each[:p] for each in known)])
-    every = _Case(problem, J, amount, J, masked, most, near.powers, begun, min(MISFIT, OPEN * left))
+    every = _Case(problem, J, amount, J, masked, most, min(MISFIT, OPEN * left))
     cases = [(replace(every, accused=each), SPLITS) for each in sets]
     while cases:
         case, splits = cases.pop()
@@ -191,10 +177,6 @@ class _Case:
         Masked meters.
     most
         Largest number of manipulated meters that is promised.
-    powers : (p,)
-        Fault of each meter's customer that is its false power.
-    known : (k, p)
-        Sets of meters from which g is looked for, besides those of the relaxation.
     left
         Share of the evidence that J leaves open.
     """
@@ -205,8 +187,6 @@ class _Case:
     accused: Bools
     masked: Bools
     most: int
-    powers: Ints
-    known: Bools
     left: float
 
     @property
@@ -229,9 +209,7 @@ class _Case:
         own, without = self.own()
         limit = own + max(_LEAST, self.left * (without - own))
         found = [
-            (any_of(self.accused & one[1]), *one)
-            for one in chain(self.instead(without, limit), self.customers())
-            if one[0] < limit
+            (any_of(self.accused & one[1]), *one) for one in self.instead(without, limit) if one[0] < limit
         ]
         if not found:
             return []
@@ -264,60 +242,23 @@ class _Case:
         problem, p, rest, masked = self.problem, self.problem.meters, self.rest, self.masked
         size = float(np.abs(self.amount[self.accused]).mean())
         yield without, rest
-        kept = []
-        for each, signs in self._beginnings():
-            at, y, F = _beside(problem, each, ~each[:p])
-            room = self.most - int(np.count_nonzero(each[:p] | masked))
-            begun = without if np.array_equal(each, rest) else float(_evidence(problem, each[None])[0])
-            s2, own = float(problem.std[0]) ** 2, self.meters[at]
-            for sign in signs:
-                relaxed = _Relaxed(sign * y, F, s2, ~masked[at], room, self.known[:, at])
-                # The best set without any of them may keep more names.
-                for barred in (np.zeros_like(own), own) if sign == -self.sign else (own,):
-                    least, inside = relaxed.found(size, barred, limit + ALIKE_LESS - begun)
-                    if any_of(inside):
-                        both = each.copy()
-                        both[at[inside]] = True
-                        kept.append(both)
-                        yield begun + least, both
-                    if least == inf or not any_of(inside & own):
-                        break
+        at, y, F = _beside(problem, rest, ~rest[:p])
+        room = self.most - int(np.count_nonzero(rest[:p] | masked))
+        s2, own, kept = float(problem.std[0]) ** 2, self.meters[at], []
+        for sign in _SIGNS:
+            relaxed = _Relaxed(sign * y, F, s2, ~masked[at], room)
+            # The best set without any of them may keep more names.
+            for barred in (np.zeros_like(own), own) if sign == -self.sign else (own,):
+                least, inside = relaxed.found(size, barred, limit + ALIKE_LESS - without)
+                if any_of(inside):
+                    both = rest.copy()
+                    both[at[inside]] = True
+                    kept.append(both)
+                    yield without + least, both
+                if least == inf or not any_of(inside & own):
+                    break
         if kept:
             yield from zip(_evidence(problem, np.stack(kept)).tolist(), kept, strict=True)
-
-    def _beginnings(self) -> list[tuple[Bools, tuple[float, ...]]]:
-        """Sets that others are added to, (q,), and the signs of these: the rest, and parts of it."""
-        rest, meter = self.rest, np.arange(self.J.size) < self.problem.meters
-        fewer: list[tuple[Bools, tuple[float, ...]]] = [(rest & meter, _SIGNS)]
-        fewer += [(rest & ~(meter & (sign * self.amount > 0.0)), (sign,)) for sign in _SIGNS]
-        return [(rest, _SIGNS), *(one for one in fewer if not np.array_equal(one[0], rest))]
-
-    def customers(self) -> Iterator[tuple[float, Bools]]:
-        """L of customers with false readings and powers in place of C, and the sets, (q,)."""
-        problem, rest, masked, powers = self.problem, self.rest, self.masked, self.powers
-        p = problem.meters
-        if not any_of(self.J[p:]):
-            return
-        charge = problem.charge.copy()
-        charge[powers] = 0.0
-        free, chosen = replace(problem, charge=charge), rest & (np.arange(rest.size) < p)
-        # The powers of masked customers are free, too.
-        least, usable = float(_evidence(free, chosen[None])[0]), (informed(problem) | masked) & ~self.meters
-        while True:
-            added = np.flatnonzero(usable & ~chosen[powers])
-            sets = np.repeat(chosen[None], added.size, axis=0)
-            sets[np.arange(added.size), added] = sets[np.arange(added.size), powers[added]] = True
-            sets = sets[np.count_nonzero(sets[:, :p] | masked, axis=1) <= self.most]
-            each = _evidence(free, sets) if len(sets) else np.zeros(0)
-            order = [k for k in np.argsort(each, kind="stable").tolist() if each[k] < least - GAIN]
-            possible = (
-                k for k in order if not any_of(np.abs(mean_amounts(free, sets[k])) > free.bound[sets[k]])
-            )
-            best = next(possible, None)
-            if best is None:
-                return
-            chosen, least = sets[best], float(each[best])
-            yield least, chosen
 
 
 def _split(accused: Bools, laterals: Bools) -> tuple[Bools, ...]:
@@ -417,8 +358,6 @@ class _Relaxed:
         Meters that count in the size of a set.
     room
         Largest number of these.
-    known : (n, k)
-        Sets that are improved besides the relaxation's.
     """
 
     y: Floats
@@ -426,13 +365,11 @@ class _Relaxed:
     s2: float
     counted: Bools
     room: int
-    known: Bools
 
     def found(self, amount: float, barred: Bools, limit: float) -> tuple[float, Bools]:
         """Least fit without the meters barred, (k,), and its set; infinite where the bound excludes all."""
         n, out = np.flatnonzero(~barred), np.zeros_like(barred)
-        F, known = submatrix(self.F, n, n), self.known[:, n]
-        part = _Relaxed(self.y[n], F, self.s2, self.counted[n], self.room, known)
+        part = _Relaxed(self.y[n], submatrix(self.F, n, n), self.s2, self.counted[n], self.room)
         least, inside = part.bound()
         least, inside = part.best(amount) if least < limit else (inf, inside)
         out[n[inside]] = True
@@ -444,11 +381,9 @@ class _Relaxed:
         if not best.size or self.room <= 0:
             return least, best
         start, tried = np.full(best.size, HALF), amount
-        known = self._known()
         for _ in range(ROUNDS):
             share, before, now = self._share(amount, start), least, 0.0
-            end = _Limited(self, np.vstack([self._rounded(share), known])).descend()
-            known = known[:0]
+            end = _Limited(self, self._rounded(share)).descend()
             one = int(end.cost.argmin())
             if end.cost[one] < least:
                 least, best = float(end.cost[one]), end.inside[one]
@@ -461,14 +396,6 @@ class _Relaxed:
             start, amount = np.clip(share * amount / now, 0.0, 1.0), now
             tried = max(tried, now)
         return least, best
-
-    def _known(self) -> Bools:
-        """Known sets with the best fits, (n, k)."""
-        count = np.count_nonzero(self.known & self.counted, axis=1)
-        some = np.unique(self.known[(count <= self.room) & self.known.any(axis=1)], axis=0)
-        one = _OneSign(self.y, self.F, self.s2, some[:0])
-        fit = one.fit(some @ self.y, np.vecdot(some @ self.F, some))
-        return np.asarray(some[np.argsort(fit, kind="stable")[:STARTS]])
 
     def _rounded(self, share: Floats) -> Bools:
         """Beginnings of the order by the shares: the best one, the larger half, and the longest, (n, k)."""

@@ -192,7 +192,6 @@ def assemble(
     attacked: int | None = None,
     inverters: tuple[Floats, Floats] | None = None,
     allowed: Floats | None = None,
-    customers: Ints | None = None,
 ) -> Core:
     """Prepare a core.
 
@@ -212,8 +211,6 @@ def assemble(
         Effect of their injections on all places, squared pu per pu, and their ranges, pu; None: none.
     allowed : (p,)
         Largest fixed error within the class of each meter, squared pu; None: no bound.
-    customers : (p,)
-        Customer of each meter; None: the first p in their order.
 
     Raises
     ------
@@ -235,7 +232,7 @@ def assemble(
         effect=np.hstack([np.zeros((len(powers), at.size)), powers, model.busbar_of[:, used]]),
         faults=signatures.columns(made, powers[at], std, SIZE),
         groups=groups(made),
-        near=mirrors.neighbourhoods(made, max(1, at.size // 3) if attacked is None else attacked, customers),
+        near=mirrors.neighbourhoods(made, max(1, at.size // 3) if attacked is None else attacked),
         estimator=estimates.estimator(made),
         bound=np.concatenate([np.full(at.size, inf), most, np.full(int(used.sum()), inf)]),
         limit=log(gamma),
@@ -268,7 +265,6 @@ def design(front: FrontDesign, most: Floats | None = None) -> Core:
         attacked=front.max_attacked,
         inverters=inverters if droop.customer.size else None,
         allowed=front.allowed,
-        customers=front.plant.meters,
     )
 
 
@@ -619,7 +615,7 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     age = int(test.onsets.age[rows[best]])
     found = mirrors.reflected(found, core.near)
     replacing = () if before is None else before.replacing
-    weighed = collusion.weighed(found, state.masked.meters, core.near, _left(state, found, age), replacing)
+    weighed = collusion.weighed(found, state.masked.meters, core.near, _left(state, found, age))
     sets = {each.tobytes(): each for each in (*weighed.replacing, *replacing)}
     found, replacing = weighed.found, tuple(sets.values())[:RECALLED]
     share = _explained(state, found, age)

@@ -41,17 +41,16 @@ def explanation(given: SearchProblem, accused: Bools, *, power: bool = False) ->
     return Identification(chosen[None], np.zeros(1, np.intp), np.ones(1), accused, (given,))
 
 
-def contested(given: Identification, masked: Bools, most: int, *, powers: bool = False) -> Bools:
+def contested(given: Identification, masked: Bools, most: int) -> Bools:
     """Named meters that other explanations replace, (p,)."""
-    return given.named & ~collusion.weighed(given, masked, near(most, powers=powers)).found.named
+    return given.named & ~collusion.weighed(given, masked, near(most)).found.named
 
 
-def near(most: int, *, powers: bool = False) -> Neighbourhoods:
-    """The two laterals, halves of them, and one phase; the one power, or a power of each meter's customer."""
+def near(most: int) -> Neighbourhoods:
+    """The two laterals, halves of them, and one phase."""
     laterals = np.repeat(np.eye(4, dtype=np.bool_), 3, axis=1)
     whole = np.repeat(np.eye(2, dtype=np.bool_), 6, axis=1)
-    own = METERS + np.arange(METERS) * powers
-    return Neighbourhoods(np.vstack([laterals, whole]), np.ones((METERS, 1), dtype=np.bool_), most, own)
+    return Neighbourhoods(np.vstack([laterals, whole]), np.ones((METERS, 1), dtype=np.bool_), most)
 
 
 def some(*meters: int) -> Bools:
@@ -60,9 +59,7 @@ def some(*meters: int) -> Bools:
 
 
 NONE = some()
-OWN = METERS + np.arange(METERS)
 NOT_FIRST = ~some(0, 1, 2, 3)
-NO_SETS = np.zeros((0, METERS), dtype=np.bool_)
 
 
 def test_the_evidence_is_the_cost_without_the_penalty_of_meters() -> None:
@@ -83,7 +80,7 @@ def test_the_set_with_one_amount_is_the_best_of_all(seed: int) -> None:
     given, room = street(0.8 * some(0, 1, 2, 3).astype(np.float64), seed), 4
     own, barred = np.append(some(7), False), some(11)
     at, y, F = collusion._beside(given, own, ~(own[:METERS] | barred))
-    found = collusion._Relaxed(y, F, 1.0, np.ones(at.size, dtype=np.bool_), room, NO_SETS[:, : at.size])
+    found = collusion._Relaxed(y, F, 1.0, np.ones(at.size, dtype=np.bool_), room)
     least, inside = found.best(0.5)
     assert set(at.tolist()) == set(range(METERS)) - {7, 11}
 
@@ -112,7 +109,7 @@ def test_a_relaxation_of_too_many_meters_is_solved_for_larger_amounts(amount: fl
     lie = np.isin(np.arange(p), rng.permutation(10)[:7])
     F = np.linalg.inv(V)
     y = F @ (0.8 * lie + np.linalg.cholesky(V) @ rng.standard_normal(p))
-    relaxed = collusion._Relaxed(y, F, 1.0, np.ones(p, dtype=np.bool_), 7, np.zeros((0, p), dtype=np.bool_))
+    relaxed = collusion._Relaxed(y, F, 1.0, np.ones(p, dtype=np.bool_), 7)
     assert relaxed._share(amount, np.full(p, 0.5)).sum() > 7.0
     least, inside = relaxed.best(amount)
     assert (inside == lie).all()
@@ -125,7 +122,7 @@ def test_the_bound_is_that_of_all_amounts_of_the_sign(seed: int, sign: float) ->
     """Against nonnegative least squares, and below the fits of all sets that a search finds."""
     given, own = street(0.8 * some(0, 1, 2, 3).astype(np.float64), seed), np.append(some(7), False)
     at, y, F = collusion._beside(given, own, ~own[:METERS])
-    relaxed = collusion._Relaxed(sign * y, F, 1.0, np.ones(at.size, dtype=np.bool_), 4, NO_SETS[:, : at.size])
+    relaxed = collusion._Relaxed(sign * y, F, 1.0, np.ones(at.size, dtype=np.bool_), 4)
     root = np.linalg.cholesky(F)
     aim = np.linalg.solve(root, sign * y)
     rest = nnls(root.T, aim)[1]
@@ -136,26 +133,11 @@ def test_the_bound_is_that_of_all_amounts_of_the_sign(seed: int, sign: float) ->
     assert set(np.flatnonzero(inside)) <= set(order[:4])
 
 
-def test_a_known_set_is_improved_within_the_promise() -> None:
-    """A set near the lie leads there; sets of more meters and of none are left out."""
-    given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
-    at, y, F = collusion._beside(given, np.zeros(METERS + 1, dtype=np.bool_), ~NONE)
-    every = np.ones(at.size, dtype=np.bool_)
-    beginning = np.stack([some(0, 1, 2, 6), some(*range(6)), NONE])
-    known = collusion._Relaxed(y, F, 1.0, every, 4, beginning)
-    assert known._known().tolist() == [some(0, 1, 2, 6).tolist()]
-    least, inside = known.best(0.8)
-    assert inside.tolist() == some(0, 1, 2, 3).tolist()
-    assert np.isclose(least, collusion._Limited(known, inside[None]).cost[0], rtol=1e-12)
-
-
-def test_sets_that_keep_names_are_known_to_the_next_search() -> None:
-    """The sets come back beside the explanations; none where no name is kept."""
+def test_sets_that_keep_names_are_told_for_the_next_search() -> None:
+    """None where no name is kept."""
     given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
     first = collusion.weighed(explanation(given, some(4, 5)), NONE, near(4))
     assert [each.tolist() for each in first.replacing] == [[*some(0, 1, 2, 3).tolist(), False]]
-    again = collusion.weighed(explanation(given, some(4, 5)), NONE, near(4), known=first.replacing)
-    assert [each.tolist() for each in again.replacing] == [[*some(0, 1, 2, 3).tolist(), False]]
     assert not collusion.weighed(explanation(given, some(0)), NONE, near(4)).replacing
 
 
@@ -352,58 +334,3 @@ def test_a_sole_fault_of_the_busbar_is_left_to_the_prior() -> None:
     assert collusion.weighed(one, NONE, near(5)).found is one
     out = collusion.weighed(one, some(11), near(5)).found
     assert out.weight @ ~out.chosen[:, -1] >= DOUBT
-
-
-def customers(lie: Floats, powers: Floats, charge: float = 5.0) -> SearchProblem:
-    """Scores of false readings (p,) and powers (p,): power 1 moves as meter 4 and power 7 beside meter 1."""
-    V = NOISE * np.eye(METERS) + SHARED * np.kron(np.eye(2), np.ones((6, 6)))
-    effect = np.tril(np.ones((METERS, METERS))) / METERS
-    effect[:, 1] = np.eye(METERS)[4] + effect[:, 7] - np.eye(METERS)[1]
-    W = np.hstack([np.eye(METERS), effect])
-    F, y = W.T @ np.linalg.solve(V, W), W.T @ np.linalg.solve(V, W @ np.append(lie, powers))
-    bound = np.append(np.full(METERS, inf), np.full(METERS, 5.0))
-    return SearchProblem(y, F, np.ones(2 * METERS), METERS, np.repeat([0.0, charge], METERS), bound)
-
-
-def test_customers_with_false_powers_contest_an_honest_meter() -> None:
-    """Meter 1 and its power imitate meter 4 and power 7; no other meters do."""
-    given = customers(2.0 * some(1), 2.0 * some(1))
-    shown = Identification(
-        np.append(some(4), some(7))[None], np.zeros(1, np.intp), np.ones(1), some(4), (given,)
-    )
-    assert (contested(shown, NONE, 4, powers=True) == some(4)).all()
-    out = collusion.weighed(shown, NONE, near(4, powers=True)).found
-    assert (out.chosen[1] == np.append(some(1), some(1))).all()
-    # The customer's meter is masked already, and its power is free.
-    assert (contested(shown, some(1), 4, powers=True) == some(4)).all()
-
-
-def instead_of_four(given: SearchProblem, rest: np.ndarray) -> list[tuple[float, np.ndarray]]:
-    """Customers in place of meter 4, beside the rest; at most 4 meters are promised."""
-    J = rest | np.append(some(4), NONE)
-    case = collusion._Case(
-        given, J, 1.0 * J, np.append(some(4), NONE), NONE, 4, OWN, NO_SETS, collusion.MISFIT
-    )
-    assert (case.rest == rest).all()
-    return list(case.customers())
-
-
-def test_customers_are_added_while_the_evidence_grows() -> None:
-    """Each set has one customer more, the best of all, within the promise and with possible powers."""
-    given = customers(0.7 * some(0, 9), 3.0 * some(0, 9) + 2.0 * some(3))
-    rest, free = np.append(NONE, some(7)), replace(given, charge=np.zeros(2 * METERS))
-    found = instead_of_four(given, rest)
-    assert [int(each[:METERS].sum()) for _, each in found] == [1, 2]
-    assert all((each[:METERS] == each[METERS:]).all() for _, each in found)
-    every = [np.append(some(k), some(k)) for k in range(METERS) if k != 4]
-    assert np.isclose(found[0][0], collusion._evidence(free, np.stack(every)).min())
-    assert np.isclose(found[1][0], collusion._evidence(free, found[1][1][None])[0])
-    assert found[1][0] < found[0][0]
-    bounded = replace(given, bound=np.append(given.bound[:METERS], np.full(METERS, 1e-6)))
-    # A better customer with an impossible power ends no search.
-    first = found[0][1]
-    given.bound[METERS:][first[METERS:]] = 0.01
-    other = instead_of_four(given, rest)[0]
-    assert not (other[1] & first).any()
-    assert not instead_of_four(bounded, rest)
-    assert not instead_of_four(given, np.append(NONE, NONE))
