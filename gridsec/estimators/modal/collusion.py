@@ -346,10 +346,10 @@ def _beside(problem: SearchProblem, own: Bools, meters: Bools) -> tuple[Ints, Fl
     at, used = np.flatnonzero(informed(problem) & meters), own.copy()
     used[at] = True
     few, place = among(problem, used), np.cumsum(used)[at] - 1
-    A = Tableau(few).pivot(own[used]).A
-    F = submatrix(A, place, place)
+    left = Tableau(few).pivot(own[used])
+    F = left.part(place)
     F[np.diag_indices(at.size)] -= problem.std[at] ** -2.0
-    return at, A[place, -1], F
+    return at, left.columns[place, 0], F
 
 
 class _OneSign(OneAmount):

@@ -26,7 +26,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import inf, log
 from typing import TypeVar
@@ -301,17 +301,26 @@ def _explored(
         only = descend(only, batches)
         keep(only)
         _neighbours(only, found)
-    for j in np.flatnonzero(best.chosen[: problem.meters]):
-        rival = best.copy()
-        rival.bar(int(j))
-        if rival.cost + min(0.0, float(rival.changes().min())) < best.cost + FAR:
-            keep(descend(rival, batches))
+    for rival in _without_each(best, best.cost + FAR):
+        keep(descend(rival, batches))
     likely = sorted((each, key) for key, each in found.items() if each < best.cost + NEAR)
     for _, key in likely[: EXPANDED + 1]:
         if key != best.chosen.tobytes():
             _neighbours(_at(problem, np.frombuffer(key, dtype=np.bool_)), found, UNLIKELY)
     _with_amounts_alike(problem, found, one_amount)
     return found
+
+
+def _without_each(best: AnyTableau, limit: float) -> Iterator[AnyTableau]:
+    """Tableaus without each meter of a set that are below a limit, alone or with one more change."""
+    out = np.flatnonzero(best.chosen[: best.problem.meters])
+    if not out.size:
+        return
+    least = np.minimum(best.changes()[out], best.seconds(out).min(axis=1))
+    for j in out[best.whole + least < limit]:
+        rival = best.copy()
+        rival.bar(int(j))
+        yield rival
 
 
 def _nearly_alike(best: Tableau, groups: Groups, whole: Floats, read: Bools) -> Bools:
@@ -356,12 +365,9 @@ def _beside_alike(end: Alike, groups: Groups) -> Bools:
     limit = end.whole - 2.0 * log(UNLIKELY)
     found = {end.chosen.tobytes(): end.whole}
     _neighbours(end, found, UNLIKELY)
-    for j in np.flatnonzero(end.chosen[: end.problem.meters]):
-        rival = end.copy()
-        rival.bar(int(j))
-        if rival.whole + min(0.0, float(rival.changes().min())) < limit:
-            descend(rival, groups)
-            found.setdefault(rival.chosen.tobytes(), rival.whole)
+    for rival in _without_each(end, limit):
+        descend(rival, groups)
+        found.setdefault(rival.chosen.tobytes(), rival.whole)
     keys = sorted(found, key=lambda key: found[key])[:SOME]
     return np.stack([np.frombuffer(key, dtype=np.bool_) for key in keys])
 
