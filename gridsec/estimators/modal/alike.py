@@ -127,16 +127,18 @@ class Alike(Tableau):
         both += self._term(score, information) - self._term(a, b)
         return both, v + left * self._mean(score, information), pivot
 
-    def group(self, members: Ints, inside: Bools) -> Floats:
+    def group(self, members: Ints, inside: Bools, block: Floats | None = None) -> Floats:
         """Change of the cost by adding the first n meters of sequences, (k, g); inf for one meter or none.
 
         Parameters
         ----------
         members, inside : (k, g)
             The sequences, filled up to the same length, and where they are members.
+        block
+            As in `within`.
         """
         a, b, pull = self._common()
-        out, free, inner = self.beginnings(members, inside, np.stack([super().amount, pull]))
+        out, free, inner = self.beginnings(members, inside, block, np.stack([super().amount, pull]))
         more = np.cumsum(free * self.own[members], axis=1)
         out += self._term(a + inner[:, 0, 1], b + more - inner[:, 1, 1]) - self._term(a, b)
         return out

@@ -52,6 +52,7 @@ from math import inf, log
 from typing import Self
 
 import numpy as np
+from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, Ints, any_of, submatrix
 from gridsec.estimators.modal.alike import HALF, bounded_minimum
@@ -148,7 +149,9 @@ def weighed(
     sets = [fresh & (sign * amount > 0.0) for sign in _SIGNS]
     sets += [np.arange(J.size) == k for k in np.flatnonzero(J[first:]) + first]
     begun = np.vstack([near.laterals, *(each[:p] for each in known)])
-    every = _Case(problem, J, amount, J, masked, most, near.powers, begun, min(MISFIT, OPEN * left))
+    whole, loose = float(_evidence(problem, J[None])[0]), _Loose.of(problem, J)
+    share = min(MISFIT, OPEN * left)
+    every = _Case(problem, J, amount, J, masked, most, near.powers, begun, share, whole, loose)
     cases = [(replace(every, accused=each), SPLITS) for each in sets]
     while cases:
         case, splits = cases.pop()
@@ -197,6 +200,10 @@ class _Case:
         Sets of meters from which g is looked for, besides those of the relaxation.
     left
         Share of the evidence that J leaves open.
+    whole
+        L of J.
+    loose
+        Bound of L without some faults; None for none.
     """
 
     problem: SearchProblem
@@ -208,6 +215,8 @@ class _Case:
     powers: Ints
     known: Bools
     left: float
+    whole: float
+    loose: _Loose | None
 
     @property
     def rest(self) -> Bools:
@@ -226,13 +235,16 @@ class _Case:
 
     def contesting(self) -> list[tuple[float, Bools]]:
         """Differences of L from J, and sets (q,) that keep names of C: those without any of C, then by L."""
-        own, without = self.own()
-        limit = own + max(_LEAST, self.left * (without - own))
-        found = [
-            (any_of(self.accused & one[1]), *one)
-            for one in chain(self.instead(without, limit), self.customers())
-            if one[0] < limit
-        ]
+        without = float(_evidence(self.problem, self.rest[None])[0])
+        excluded = self.loose is not None and (
+            self.loose.without(self.accused, self.sign) > self._limit(self.whole, without) + ALIKE_LESS
+        )
+        if excluded and not any_of(self.J[self.problem.meters :]):
+            return []
+        own = self.own(without)
+        limit = self._limit(own, without)
+        sets = chain(() if excluded else self.instead(without, limit), self.customers())
+        found = [(any_of(self.accused & one[1]), *one) for one in sets if one[0] < limit]
         if not found:
             return []
         found.sort(key=lambda one: one[:2])
@@ -242,16 +254,19 @@ class _Case:
         near = more < np.maximum(_LEAST, self.left * alone)
         return [(one, other) for one, (*_, other), some in zip(more, found, near, strict=True) if some]
 
-    def own(self) -> tuple[float, float]:
-        """L of the explanation, with one amount of C where that is less, and without C."""
+    def _limit(self, own: float, without: float) -> float:
+        """Limit that L of a set is to fall below, by L of the explanation and of that without C."""
+        return own + max(_LEAST, self.left * (without - own))
+
+    def own(self, without: float) -> float:
+        """L of the explanation, with one amount of C where that is less; `without`: L without C."""
         problem, rest = self.problem, self.rest
-        whole, without = _evidence(problem, np.stack([self.J, rest])).tolist()
         if not any_of(self.meters):
-            return whole, without
+            return self.whole
         at, y, F = _beside(problem, rest, self.meters)
         every = np.ones((1, at.size), dtype=np.bool_)
         alike = _OneSign(self.sign * y, F, float(problem.std[0]) ** 2, every).cost[0]
-        return min(whole, without + alike), without
+        return min(self.whole, without + float(alike))
 
     def instead(self, without: float, limit: float) -> Iterator[tuple[float, Bools]]:
         """L of sets without C, or with the reverse sign of some, and the sets, (q,).
@@ -318,6 +333,55 @@ class _Case:
                 return
             chosen, least = sets[best], float(each[best])
             yield least, chosen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Loose:
+    """Bound of L of all sets of meters beside the other faults of an explanation.
+
+    The amounts of meters have no prior. With the amounts m that fit best and their covariance G, amounts f of
+    some of these leave ``(f - m)' G^-1 (f - m)`` more of the misfit.
+
+    Attributes
+    ----------
+    place : (q,)
+        Number of each fault among the k usable ones; -1 for others.
+    mean, cov : (k,), (k, k)
+        m and G of the usable faults.
+    least
+        The bound.
+    """
+
+    place: Ints
+    mean: Floats
+    cov: Floats
+    least: float
+
+    @classmethod
+    def of(cls, problem: SearchProblem, J: Bools) -> Self | None:
+        """Bound beside the faults of J that are no meters, (q,); None where readings are too few."""
+        meter = np.arange(J.size) < problem.meters
+        at = np.flatnonzero(np.append(informed(problem), J[problem.meters :]))
+        A, place = submatrix(problem.F, at, at), np.full(J.size, -1)
+        A[np.diag_indices(at.size)] += np.where(meter, 0.0, problem.std**-2.0)[at]
+        half, failed = lapack.dpotrf(A, lower=True, overwrite_a=True)
+        if failed:
+            return None
+        inverse, _ = lapack.dpotri(half, lower=True)
+        cov = np.tril(inverse) + np.tril(inverse, -1).T
+        place[at], mean = np.arange(at.size), cov @ problem.y[at]
+        return cls(place, mean, cov, -float(problem.y[at] @ mean))
+
+    def without(self, accused: Bools, sign: float) -> float:
+        """Bound of sets without some faults (q,), or with their meters' amounts of the reverse sign."""
+        at = self.place[accused]
+        at = at[at >= 0]
+        if not at.size:
+            return self.least
+        mean = sign * self.mean[at]
+        precision = np.asarray(np.linalg.inv(submatrix(self.cov, at, at)), np.float64)
+        off = mean + bounded_minimum(precision, -(precision @ mean), np.zeros(at.size), inf)
+        return self.least + float(off @ precision @ off)
 
 
 def _split(accused: Bools, laterals: Bools) -> tuple[Bools, ...]:

@@ -496,10 +496,16 @@ class Tableau:
         both += self.penalty[np.minimum(count, p)] - self.penalty[k]
         return both, pull, pivot
 
-    def within(self, members: Ints, inside: Bools) -> Floats:
-        """Blocks of the tableau for some sets, (k, g, g), filled up by the identity; as in `toggled`."""
-        n, (every, place) = np.arange(members.shape[1]), np.unique(members, return_inverse=True)
-        A = self.part(every)[place[:, :, None], place[:, None, :]]
+    def within(self, members: Ints, inside: Bools, block: Floats | None = None) -> Floats:
+        """Blocks of the tableau for some sets, (k, g, g), filled up by the identity; as in `toggled`.
+
+        block: entries between the first faults, all members among them; None: computed here.
+        """
+        n, place = np.arange(members.shape[1]), members
+        if block is None:
+            every, place = np.unique(members, return_inverse=True)
+            block = self.part(every)
+        A = block[place[:, :, None], place[:, None, :]]
         A *= inside[:, :, None] & inside[:, None, :]
         A[:, n, n] += ~inside
         return A
@@ -579,7 +585,7 @@ class Tableau:
         column[self.order], column[j] = self.beside[j], self.diagonal[j]
         return column
 
-    def group(self, members: Ints, inside: Bools) -> Floats:
+    def group(self, members: Ints, inside: Bools, block: Floats | None = None) -> Floats:
         """Change of the cost by adding the first n meters of sequences, (k, g); inf for one meter or none.
 
         The factor of a sequence contains those of its beginnings. Chosen meters stay chosen.
@@ -588,23 +594,27 @@ class Tableau:
         ----------
         members, inside : (k, g)
             The sequences, filled up to the same length, and where they are members.
+        block
+            As in `within`.
         """
-        return self.beginnings(members, inside, self.columns[: self.chosen.size, :1].T)[0]
+        return self.beginnings(members, inside, block, self.columns[: self.chosen.size, :1].T)[0]
 
-    def beginnings(self, members: Ints, inside: Bools, rows: Floats) -> tuple[Floats, Bools, Floats]:
+    def beginnings(
+        self, members: Ints, inside: Bools, block: Floats | None, rows: Floats
+    ) -> tuple[Floats, Bools, Floats]:
         """The same, new members (k, g), and the products of rows (r, q) over the new members, (k, r, r, g).
 
         Parameters
         ----------
-        members, inside : (k, g)
-            The sequences.
+        members, inside, block
+            As in `group`.
         rows : (r, q)
             The scores, and other rows beside the tableau.
         """
         p, free, k = self.problem.meters, inside & ~self.chosen[members], self.count
         count = np.cumsum(free, axis=1)
         v = rows[:, members].transpose(1, 0, 2) * free[:, None]
-        log_det, inner = _fits(self.within(members, free), v)
+        log_det, inner = _fits(self.within(members, free, block), v)
         size = np.cumsum(free * self.size[members], axis=1)
         out = log_det + size - inner[:, 0, 0] + self.penalty[np.minimum(k + count, p)] - self.penalty[k]
         barred = np.logical_or.accumulate(free & self.barred[members], axis=1)

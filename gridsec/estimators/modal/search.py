@@ -161,9 +161,9 @@ def _exchanged(tableau: Tableau) -> bool:
 
 def _grouped(tableau: Tableau, groups: Groups) -> bool:
     """Add the rest of the best group, if one helps."""
-    best, least = None, -GAIN
+    best, least, block = None, -GAIN, tableau.part(np.arange(tableau.problem.meters))
     for members, inside, ends in groups:
-        change = np.where(ends, tableau.group(members, inside), inf)
+        change = np.where(ends, tableau.group(members, inside, block), inf)
         k, n = np.unravel_index(int(change.argmin()), change.shape)
         if change[k, n] < least:
             best, least = members[k, : n + 1], float(change[k, n])
@@ -472,20 +472,18 @@ _FLIPS = 4
 
 def _neighbours(best: Tableau, found: dict[bytes, float], least: float = BELIEVED) -> None:
     """Add the sets that differ from the best by one addition, removal or exchange, if they weigh anything."""
-    limit = min(found.values()) - 2.0 * log(least)
-    whole, change = best.whole, best.changes()
-    for j in np.flatnonzero(whole + change < limit):
-        chosen = best.chosen.copy()
-        chosen[j] = not chosen[j]
-        found.setdefault(chosen.tobytes(), whole + float(change[j]))
-    out = np.flatnonzero(best.chosen)
-    if not out.size:
-        return
-    both = best.exchanges(out)
-    for i, j in zip(*np.nonzero(whole + both < limit), strict=True):
-        chosen = best.chosen.copy()
-        chosen[out[i]], chosen[j] = False, True
-        found.setdefault(chosen.tobytes(), whole + float(both[i, j]))
+    limit = min(found.values()) - 2.0 * log(least) - best.whole
+    change, out = best.changes(), np.flatnonzero(best.chosen)
+    one = np.flatnonzero(change < limit)
+    both = best.exchanges(out) if out.size else np.zeros((0, change.size))
+    i, j = np.nonzero(both < limit)
+    sets = np.tile(best.chosen, (one.size + j.size, 1))
+    rows = np.arange(one.size, len(sets))
+    sets[np.arange(one.size), one] ^= True
+    sets[rows, out[i]], sets[rows, j] = False, True
+    more = np.concatenate([change[one], both[i, j]]) + best.whole
+    for chosen, each in zip(sets, more.tolist(), strict=True):
+        found.setdefault(chosen.tobytes(), each)
 
 
 def costs_of(found: Identification) -> list[dict[bytes, float]]:
