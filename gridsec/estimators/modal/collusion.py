@@ -41,6 +41,9 @@ the laterals and of such sets of earlier searches. x is first the mean amount of
 found. Where that gains nothing and the solution has more meters than the promise, x is larger. Where the best
 g has meters of C, the best one without them is also found. g is also looked for in place of the rest's meters
 of its own sign, since colluding meters may share one amount, and of its faults that are no meters.
+
+Before all that, one bound of L excludes most C (`_Loose`): any amounts of all other meters, and amounts of the
+reverse sign of C. It takes one inverse of F for all C, and a problem of the size of C each.
 """
 
 from __future__ import annotations

@@ -353,6 +353,31 @@ class Joint:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class InModes:
+    """Scores and information of one onset in the modes, ``diag(own) - side cov side'``.
+
+    Attributes
+    ----------
+    U : (t, t)
+        As in `Modes`.
+    score, own : (t,), (t,)
+        y, and the information without the directions.
+    side, cov : (t, r), (r, r)
+        Regression on the directions, and the covariance of these.
+    """
+
+    U: Floats = field(repr=False)
+    score: Floats
+    own: Floats
+    side: Floats
+    cov: Floats
+
+    def times(self, W: Floats) -> Floats:
+        """Product of the information with columns in the modes, (t, k)."""
+        return np.asarray(self.own[:, None] * W - self.side @ (self.cov @ (self.side.T @ W)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Scored:
     """Scores and information of faults of the t members together, at one onset: `Joint` at the members.
 
@@ -360,10 +385,27 @@ class Scored:
     ----------
     score, information : (t,), (t, t)
         y and F of the members.
+    in_modes
+        The same in the modes, where no reading is missing: columns of many members cancel there less.
     """
 
     score: Floats
     information: Floats = field(repr=False)
+    in_modes: InModes | None = field(default=None, repr=False)
+
+    def of(self, columns: Floats, W: Floats) -> tuple[Floats, Floats, Floats]:
+        """Scores (k,) of columns, their information with the members (t, k), and with each other (k, k).
+
+        Parameters
+        ----------
+        columns, W : (t, k)
+            The columns at the members, and in the modes.
+        """
+        if self.in_modes is None:
+            side = self.information @ columns
+            return self.score @ columns, side, columns.T @ side
+        side = self.in_modes.times(W)
+        return self.in_modes.score @ W, self.in_modes.U @ side, W.T @ side
 
     def misfit(self, precision: Floats) -> float:
         """Cost of faults of all members, up to a constant; O(t^3).
@@ -400,13 +442,14 @@ class Scored:
 
 def scored(modes: Modes, onsets: Onsets, static: Static, row: int) -> Scored:
     """Scores and information at the members of one row; as `joint`."""
-    score, U = onsets.score[row], modes.U
-    information = (U * onsets.information[row]) @ U.T
+    score, U, own = onsets.score[row], modes.U, onsets.information[row]
+    side, cov = np.zeros((own.size, 0)), np.zeros((0, 0))
     if modes.sign.size:
         score = score - onsets.cross[row] * static.constant
-        side = U @ (onsets.cross[row][:, None] * modes.directions)
-        information -= side @ (current(modes, static).cov @ side.T)
-    return Scored(U @ score, information)
+        side, cov = onsets.cross[row][:, None] * modes.directions, current(modes, static).cov
+    of_members = U @ side
+    information = (U * own) @ U.T - of_members @ cov @ of_members.T
+    return Scored(U @ score, information, InModes(U, score, own, side, cov))
 
 
 def joint(modes: Modes, onsets: Onsets, static: Static, row: int) -> Joint:
@@ -464,13 +507,12 @@ class Columns:
         used : (q,)
             The faults.
         """
-        y, F, others = scored.score, scored.information, self.beside
+        p = self.members
+        some: slice | Bools = slice(None) if used is None else used[p:]
+        y, F = scored.score, scored.information
+        of_others, side, inner = scored.of(self.beside[:, some], self.W[:, p:][:, some])
         if used is not None:
-            others = others[:, used[self.members :]]
-        side, of_others = F @ others, y @ others
-        inner = others.T @ side
-        if used is not None:
-            own = np.flatnonzero(used[: self.members])
+            own = np.flatnonzero(used[:p])
             y, F, side = y[own], submatrix(F, own, own), side[own]
         return np.append(y, of_others), np.block([[F, side], [side.T, inner]])
 
