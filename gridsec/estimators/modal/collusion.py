@@ -42,8 +42,8 @@ found. Where that gains nothing and the solution has more meters than the promis
 g has meters of C, the best one without them is also found. g is also looked for in place of the rest's meters
 of its own sign, since colluding meters may share one amount, and of its faults that are no meters.
 
-Before all that, one bound of L excludes most C (`_Loose`): any amounts of all other meters, and amounts of the
-reverse sign of C. It takes one inverse of F for all C, and a problem of the size of C each.
+Before all that, one bound of L excludes most C (`_Loose`): any amounts of all other meters, and amounts of
+the reverse sign of C. It takes one inverse of F for all C, and a problem of the size of C each.
 """
 
 from __future__ import annotations

@@ -158,10 +158,11 @@ class _Likelihood:
 
     def __init__(self, problem: SearchProblem, chosen: Bools) -> None:
         self.problem, self.chosen = problem, chosen
-        self.shares: tuple[float, ...] = (0.0, ALIKE)
+        several = np.count_nonzero(chosen[: problem.meters]) > 1
+        self.shares: tuple[float, ...] = (0.0, ALIKE) if several else (0.0,)
         few, every = among(problem, chosen), np.ones(int(np.count_nonzero(chosen)), dtype=np.bool_)
-        plain, alike = Tableau(few), Alike(few, ALIKE)
-        self.tableaus: dict[float, Tableau] = {0.0: plain.pivot(every), ALIKE: alike.pivot(every)}
+        starts = {share: Alike(few, share) if share else Tableau(few) for share in self.shares}
+        self.tableaus = {share: start.pivot(every) for share, start in starts.items()}
         own = self._each(chosen[None], np.zeros((1, problem.meters), dtype=np.bool_))
         # A prior that is far worse for the set is so for its images.
         least = own.min() + APART
@@ -175,9 +176,10 @@ class _Likelihood:
     def _each(self, rest: Bools, columns: Bools) -> Floats:
         """L with each prior that counts, (s, n); one meter has no amount in common with others."""
         several = np.count_nonzero(rest[:, : self.problem.meters], axis=1) > 1
-        shares = set(self.shares) if several.all() else {0.0, *self.shares}
-        each = {share: self._with(rest, columns, share) for share in shares}
-        return np.stack([np.where(several, each[share], each.get(0.0, 0.0)) for share in self.shares])
+        shares = {share for share in self.shares if several.any()}
+        each = {s: self._with(rest, columns, s) for s in (shares if several.all() else shares | {0.0})}
+        plain = each.get(0.0, np.zeros(len(rest)))
+        return np.stack([np.where(several, each.get(share, plain), plain) for share in self.shares])
 
     def _with(self, rest: Bools, columns: Bools, share: float) -> Floats:
         """L with a share of the variance of the meters in common, (n,)."""
