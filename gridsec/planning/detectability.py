@@ -649,6 +649,6 @@ class NamedSizes:
 
 def _split(found: Tableau, size: float) -> tuple[Floats, float]:
     """``A_J e_k``, (p,), and the cost of a set without its misfit, for the scores of a step of meter k."""
-    p, column, chosen = found.problem.meters, found.A[:-1, -1], found.chosen
+    p, column, chosen = found.problem.meters, found.borders[:-1, 0], found.chosen
     felt = np.where(chosen, column / found.problem.std**2, column)[:p] / size
-    return felt, found.cost - float(found.A[-1, -1])
+    return felt, found.cost - float(found.borders[-1, 0])

@@ -84,8 +84,8 @@ class Alike(Tableau):
     def _common(self) -> tuple[float, float, Floats]:
         """Score and information of the common amount, and the pull of every fault, (q,)."""
         q = self.chosen.size
-        information = float(self.own[self.chosen].sum() + self.A[q + 1, q + 1])
-        return -float(self.A[q, q + 1]), information, self.A[:q, q + 1]
+        pull = self.borders[:, 1]
+        return -float(pull[q]), float(self.own[self.chosen].sum() + pull[q + 1]), pull[:q]
 
     def _term(self, score: Floats | float, information: Floats | float) -> Floats:
         """Cost of the common amount."""
@@ -111,7 +111,7 @@ class Alike(Tableau):
         """Change of the cost by toggling each fault, and its amount times its pivot, (q,)."""
         out, v = super().steps()
         a, b, pull = self._common()
-        c, more = self.A.diagonal()[: v.size], np.where(self.chosen, -self.own, self.own)
+        c, more = self.diagonal, np.where(self.chosen, -self.own, self.own)
         score, information = a + pull * v / c, b + more - pull * pull / c
         out += self._term(score, information) - self._term(a, b)
         return out, v + pull * self._mean(score, information)
@@ -119,24 +119,26 @@ class Alike(Tableau):
     def pairs(self, out: Ints) -> tuple[Floats, Floats, Floats]:
         """Change of the cost by exchanges, the amount of the new one times its pivot, and that, (k, q)."""
         both, v, pivot = super().pairs(out)
-        q, (a, b, pull) = self.chosen.size, self._common()
-        c = self.A.diagonal()[:q][out]
-        left = pull - self.A[out, :q] * (pull[out] / c)[:, None]
-        score = (a + pull[out] * self.A[out, q] / c)[:, None] + left * v / pivot
-        information = (b - self.own[out] - pull[out] ** 2 / c)[:, None] + self.own - left * left / pivot
+        c, (a, b, pull) = self.diagonal[out], self._common()
+        more = np.where(self.chosen, -self.own, self.own)
+        left = pull - self.of(out) * (pull[out] / c)[:, None]
+        score = (a + pull[out] * self.columns[out, 0] / c)[:, None] + left * v / pivot
+        information = (b - self.own[out] - pull[out] ** 2 / c)[:, None] + more - left * left / pivot
         both += self._term(score, information) - self._term(a, b)
         return both, v + left * self._mean(score, information), pivot
 
-    def group(self, members: Ints, inside: Bools) -> Floats:
+    def group(self, members: Ints, inside: Bools, block: Floats | None = None) -> Floats:
         """Change of the cost by adding the first n meters of sequences, (k, g); inf for one meter or none.
 
         Parameters
         ----------
         members, inside : (k, g)
             The sequences, filled up to the same length, and where they are members.
+        block
+            As in `within`.
         """
         a, b, pull = self._common()
-        out, free, inner = self.beginnings(members, inside, np.stack([super().amount, pull]))
+        out, free, inner = self.beginnings(members, inside, block, np.stack([super().amount, pull]))
         more = np.cumsum(free * self.own[members], axis=1)
         out += self._term(a + inner[:, 0, 1], b + more - inner[:, 1, 1]) - self._term(a, b)
         return out
@@ -149,7 +151,7 @@ class Alike(Tableau):
         common
             Common amount in prior standard deviations; None: its posterior mean, 0 without a meter.
         """
-        p, q = self.problem.meters, self.chosen.size
+        p = self.problem.meters
         score, information, pull = self._common()
         common = float(self._mean(score, information)) if common is None else common
         out = self.chosen.copy()
@@ -158,9 +160,9 @@ class Alike(Tableau):
             return out
         x = common * self.w[new] * self.problem.std[new] ** 2.0
         # Without the own variances of the new meters, and with the common amount of the set alone.
-        A = submatrix(self.A[:q, :q], new, new)
+        A = self.part(new)
         A[np.diag_indices(new.size)] -= self.problem.std[new] ** -2.0
-        left = self.A[new, q] + common * (pull - self.w)[new]
+        left = self.columns[new, 0] + common * (pull - self.w)[new]
         share = bounded_minimum(A * np.outer(x, x), x * left, np.full(new.size, HALF))
         out[new[share > HALF]] = True
         return out

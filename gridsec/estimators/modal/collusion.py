@@ -34,6 +34,9 @@ of a naming, the meters with the largest z are the only g. Elsewhere the relaxat
 meters, and the best beginning of this order is improved by single meters and by exchanges. x is first the
 mean amount of C, then that of the set found. Where that gains nothing and the solution has more meters than
 the promise, x is larger. Where the best g has meters of C, the best one without them is also found.
+
+Before all that, one bound of L excludes most C (`_Loose`): any amounts of all other meters, and amounts of
+the reverse sign of C. It takes one inverse of F for all C, and a problem of the size of C each.
 """
 
 from __future__ import annotations
@@ -44,6 +47,7 @@ from math import inf, log
 from typing import Self
 
 import numpy as np
+from scipy.linalg import lapack
 
 from gridsec.arrays import Bools, Floats, Ints, any_of, submatrix
 from gridsec.estimators.modal.alike import HALF, bounded_minimum
@@ -134,7 +138,8 @@ def weighed(
     fresh[:p] &= ~masked
     sets = [fresh & (sign * amount > 0.0) for sign in _SIGNS]
     sets += [np.arange(J.size) == k for k in np.flatnonzero(J[first:]) + first]
-    every = _Case(problem, J, amount, J, masked, most, min(MISFIT, OPEN * left))
+    whole, loose = float(_evidence(problem, J[None])[0]), _Loose.of(problem, J)
+    every = _Case(problem, J, amount, J, masked, most, min(MISFIT, OPEN * left), whole, loose)
     cases = [(replace(every, accused=each), SPLITS) for each in sets]
     while cases:
         case, splits = cases.pop()
@@ -179,6 +184,10 @@ class _Case:
         Largest number of manipulated meters that is promised.
     left
         Share of the evidence that J leaves open.
+    whole
+        L of J.
+    loose
+        Bound of L without some faults; None for none.
     """
 
     problem: SearchProblem
@@ -188,6 +197,8 @@ class _Case:
     masked: Bools
     most: int
     left: float
+    whole: float
+    loose: _Loose | None
 
     @property
     def rest(self) -> Bools:
@@ -206,8 +217,13 @@ class _Case:
 
     def contesting(self) -> list[tuple[float, Bools]]:
         """Differences of L from J, and sets (q,) that keep names of C: those without any of C, then by L."""
-        own, without = self.own()
-        limit = own + max(_LEAST, self.left * (without - own))
+        without = float(_evidence(self.problem, self.rest[None])[0])
+        if self.loose is not None:
+            least = self.loose.without(self.accused, self.sign)
+            if least > self._limit(self.whole, without) + ALIKE_LESS:
+                return []
+        own = self.own(without)
+        limit = self._limit(own, without)
         found = [
             (any_of(self.accused & one[1]), *one) for one in self.instead(without, limit) if one[0] < limit
         ]
@@ -220,16 +236,19 @@ class _Case:
         near = more < np.maximum(_LEAST, self.left * alone)
         return [(one, other) for one, (*_, other), some in zip(more, found, near, strict=True) if some]
 
-    def own(self) -> tuple[float, float]:
-        """L of the explanation, with one amount of C where that is less, and without C."""
+    def _limit(self, own: float, without: float) -> float:
+        """Limit that L of a set is to fall below, by L of the explanation and of that without C."""
+        return own + max(_LEAST, self.left * (without - own))
+
+    def own(self, without: float) -> float:
+        """L of the explanation, with one amount of C where that is less; `without`: L without C."""
         problem, rest = self.problem, self.rest
-        whole, without = _evidence(problem, np.stack([self.J, rest])).tolist()
         if not any_of(self.meters):
-            return whole, without
+            return self.whole
         at, y, F = _beside(problem, rest, self.meters)
         every = np.ones((1, at.size), dtype=np.bool_)
         alike = _OneSign(self.sign * y, F, float(problem.std[0]) ** 2, every).cost[0]
-        return min(whole, without + alike), without
+        return min(self.whole, without + float(alike))
 
     def instead(self, without: float, limit: float) -> Iterator[tuple[float, Bools]]:
         """L of sets without C, or with the reverse sign of some, and the sets, (q,).
@@ -261,6 +280,55 @@ class _Case:
             yield from zip(_evidence(problem, np.stack(kept)).tolist(), kept, strict=True)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Loose:
+    """Bound of L of all sets of meters beside the other faults of an explanation.
+
+    The amounts of meters have no prior. With the amounts m that fit best and their covariance G, amounts f of
+    some of these leave ``(f - m)' G^-1 (f - m)`` more of the misfit.
+
+    Attributes
+    ----------
+    place : (q,)
+        Number of each fault among the k usable ones; -1 for others.
+    mean, cov : (k,), (k, k)
+        m and G of the usable faults.
+    least
+        The bound.
+    """
+
+    place: Ints
+    mean: Floats
+    cov: Floats
+    least: float
+
+    @classmethod
+    def of(cls, problem: SearchProblem, J: Bools) -> Self | None:
+        """Bound beside the faults of J that are no meters, (q,); None where readings are too few."""
+        meter = np.arange(J.size) < problem.meters
+        at = np.flatnonzero(np.append(informed(problem), J[problem.meters :]))
+        A, place = submatrix(problem.F, at, at), np.full(J.size, -1)
+        A[np.diag_indices(at.size)] += np.where(meter, 0.0, problem.std**-2.0)[at]
+        half, failed = lapack.dpotrf(A, lower=True, overwrite_a=True)
+        if failed:
+            return None
+        inverse, _ = lapack.dpotri(half, lower=True)
+        cov = np.tril(inverse) + np.tril(inverse, -1).T
+        place[at], mean = np.arange(at.size), cov @ problem.y[at]
+        return cls(place, mean, cov, -float(problem.y[at] @ mean))
+
+    def without(self, accused: Bools, sign: float) -> float:
+        """Bound of sets without some faults (q,), or with their meters' amounts of the reverse sign."""
+        at = self.place[accused]
+        at = at[at >= 0]
+        if not at.size:
+            return self.least
+        mean = sign * self.mean[at]
+        precision = np.asarray(np.linalg.inv(submatrix(self.cov, at, at)), np.float64)
+        off = mean + bounded_minimum(precision, -(precision @ mean), np.zeros(at.size), inf)
+        return self.least + float(off @ precision @ off)
+
+
 def _split(accused: Bools, laterals: Bools) -> tuple[Bools, ...]:
     """Accused faults (q,) inside and outside of the lateral (g, p) with most meters of them, but not all.
 
@@ -287,10 +355,10 @@ def _beside(problem: SearchProblem, own: Bools, meters: Bools) -> tuple[Ints, Fl
     at, used = np.flatnonzero(informed(problem) & meters), own.copy()
     used[at] = True
     few, place = among(problem, used), np.cumsum(used)[at] - 1
-    A = Tableau(few).pivot(own[used]).A
-    F = submatrix(A, place, place)
+    left = Tableau(few).pivot(own[used])
+    F = left.part(place)
     F[np.diag_indices(at.size)] -= problem.std[at] ** -2.0
-    return at, A[place, -1], F
+    return at, left.columns[place, 0], F
 
 
 class _OneSign(OneAmount):

@@ -21,7 +21,6 @@ from dataclasses import dataclass, field, replace
 from math import inf, log
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
 
 from gridsec.arrays import Bools, Floats, Ints, any_of, indices
 from gridsec.errors import InputInvalid, Problem
@@ -53,7 +52,7 @@ from gridsec.estimators.modal.model import Modes, ResidualModel, modes, residual
 from gridsec.estimators.modal.replay import History, Parts, Suspected
 from gridsec.estimators.modal.rivals import Rival
 from gridsec.estimators.modal.search import DOUBT, Identification, search
-from gridsec.estimators.modal.signatures import Columns, Joint
+from gridsec.estimators.modal.signatures import Columns, Joint, Scored
 from gridsec.estimators.modal.static import Static
 from gridsec.grid.network import Power
 
@@ -396,8 +395,8 @@ def amounts(core: Core, state: CoreState, suspicion: Suspicion) -> Floats:
     found, out = suspicion.found, np.zeros(core.effect.shape[1])
     model, chosen = int(found.model[0]), found.chosen[0]
     # The amounts of a ramp are those of its unit of time.
-    joint = _joint_under(core, state, suspicion.row, model)
-    out[chosen] = joint.level * mean_amounts(found.problems[model], chosen)
+    level = state.rivals[model].level if model else _level(core, state, suspicion.row)
+    out[chosen] = level * mean_amounts(found.problems[model], chosen)
     return out
 
 
@@ -603,15 +602,18 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     test, known = state.detector, None if before is None else _keeping(before)
     rows = [] if state.suspected else [int(evidence.rows[0])]
     rows = list(dict.fromkeys(rows + np.flatnonzero(test.pinned & test.onsets.used).tolist()))
-    joints = {row: _joint(core, _parts(state), row) for row in rows}
-    rows = sorted(rows, key=lambda row: _misfit(core, joints[row]))
-    problems = [_problem(core, joints[row], state.history.unknown) for row in rows]
-    found = _searched(core, state, problems[0], known)
-    std = found.problems[0].std
-    costs = [cost(replace(one, std=std), found.chosen[0]) - 2.0 * gain for one, gain in problems]
-    best = int(np.argmin(costs))
+    scored = {row: _scored(core, state, row) for row in rows}
+    rows = sorted(rows, key=lambda row: _misfit(core, scored[row]))
+    best, unknown = 0, state.history.unknown
+    found = _searched(core, state, _problem(core, scored[rows[0]], unknown), known)
+    if len(rows) > 1:
+        used, std = found.chosen[0], found.problems[0].std
+        few = [_problem(core, scored[row], unknown, used) for row in rows]
+        every = np.ones(int(np.count_nonzero(used)), dtype=np.bool_)
+        costs = [cost(replace(one, std=std[used]), every) - 2.0 * gain for one, gain in few]
+        best = int(np.argmin(costs))
     if best:
-        found = _searched(core, state, problems[best], known)
+        found = _searched(core, state, _problem(core, scored[rows[best]], unknown), known)
     age = int(test.onsets.age[rows[best]])
     found = mirrors.reflected(found, core.near)
     replacing = () if before is None else before.replacing
@@ -696,7 +698,7 @@ def transition(core: Core, state: CoreState, suspicion: Suspicion) -> CoreState:
         return state
 
     def cost_of(rival: Rival) -> float:
-        return _misfit(core, rival.joint()) - 2.0 * rival.evidence
+        return _misfit(core, rival.scored()) - 2.0 * rival.evidence
 
     ramp = bool(state.detector.onsets.ramp[suspicion.row])
     found = rivals.transitions(core.modes, state.history, age, ramp=ramp)
@@ -743,14 +745,12 @@ def _keeping(before: Suspicion) -> Bools:
     return np.unique(np.vstack([best, *found.chosen[lacks][:RECALLED], *before.replacing]), axis=0)
 
 
-def _misfit(core: Core, joint: Joint) -> float:
-    """Cost of faults of all members at one onset, without the penalty; O(t^3).
+def _misfit(core: Core, scored: Scored) -> float:
+    """Cost of faults of all members at one onset, without the penalty, up to a constant; O(t^3).
 
     The amounts have the prior of `detector.omnibus`. The likeliest onset then seldom changes after a search.
     """
-    s2, y = SIZE**2 / core.modes.white, joint.score
-    A = joint.information + np.eye(y.size) / s2
-    return float(np.linalg.slogdet(A)[1] - y @ np.linalg.solve(A, y))
+    return scored.misfit(core.modes.precision * (core.modes.white / SIZE**2))
 
 
 def _parts(state: CoreState) -> Parts:
@@ -764,6 +764,21 @@ def _joint(core: Core, parts: Parts, row: int) -> Joint:
         if each.row == row:
             return each.joint(core.modes)
     return signatures.joint(core.modes, detector.followed(core.modes, test).onsets, known, row)
+
+
+def _scored(core: Core, state: CoreState, row: int) -> Scored:
+    """Scores and information of the members at one onset."""
+    for each in state.suspected:
+        if each.row == row:
+            return each.scored
+    test = detector.followed(core.modes, state.detector)
+    return signatures.scored(core.modes, test.onsets, state.static, row)
+
+
+def _level(core: Core, state: CoreState, row: int) -> float:
+    """Level u of one onset at the last tick."""
+    exact = (each.level for each in state.suspected if each.row == row)
+    return next(exact, float(detector.followed(core.modes, state.detector).onsets.level[row]))
 
 
 def _joint_under(core: Core, state: CoreState, row: int, model: int) -> Joint:
@@ -782,34 +797,39 @@ def _searched(
     less = 2.0 * log(PRIOR * len(others) / (1.0 - PRIOR))
     found = []
     for each in others:
-        problem, more = _problem(core, each.joint(), open_)
+        problem, more = _problem(core, each.scored(), open_)
         found.append((problem, 2.0 * (plain.evidence + gain - each.evidence - more) + less))
     return search(model, core.groups, found, core.near.laterals, known)
 
 
-def _problem(core: Core, joint: Joint, unknown: Floats | None) -> tuple[SearchProblem, float]:
-    """Scores, information and charges of all faults at one onset, and the gain of evidence by unknown errors.
+def _problem(
+    core: Core, scored: Scored, unknown: Floats | None, used: Bools | None = None
+) -> tuple[SearchProblem, float]:
+    """Scores, information and charges of faults at one onset, and the gain of evidence by unknown errors.
 
     The filter takes the error along an unknown direction as white. One that lasts since the onset would count
     against a set of faults at every tick. Its amount, N(0, LASTS^2) of the direction as in `masking`, is
-    integrated out: with scores y and information F of faults and directions n,
+    integrated out.
 
-        M = F_nn + 1,  y - F_n M^-1 y_n,  F - F_n M^-1 F_n',  gain = (y_n' M^-1 y_n - log det M) / 2
+    Parameters
+    ----------
+    core, scored, unknown
+        The core, the scores of the members, and the unknown directions (p, k).
+    used : (q,)
+        The faults; None: all.
     """
-    faults, p, q = core.faults, core.modes.size, core.faults.std.size
-    W = faults.W if unknown is None else np.hstack([faults.W, masking.LASTS * (core.modes.U.T @ unknown)])
-    y, F = joint.of(W)
-    gain = 0.0
+    faults, p, q, gain = core.faults, core.modes.size, core.faults.std.size, 0.0
     if unknown is not None:
-        half = cholesky(F[q:, q:] + np.eye(len(y) - q), lower=True)
-        white = solve_triangular(half, np.hstack([F[q:, :q], y[q:, None]]), lower=True)
-        y, F = y[:q] - white[:, :q].T @ white[:, q], F[:q, :q] - white[:, :q].T @ white[:, :q]
-        gain = 0.5 * float(white[:, q] @ white[:, q]) - float(np.log(half.diagonal()).sum())
+        scored, gain = scored.beside(masking.LASTS * unknown)
+    y, F = faults.of(scored, used)
     accusation = 2.0 * log(p)
     charge = np.zeros(q)
     charge[p:] = accusation
     charge[p : p + faults.powers] = ACCUSATIONS * accusation
-    return SearchProblem(y, F, faults.std, p, charge, core.bound), gain
+    if used is None:
+        return SearchProblem(y, F, faults.std, p, charge, core.bound), gain
+    meters = int(np.count_nonzero(used[:p]))
+    return SearchProblem(y, F, faults.std[used], meters, charge[used], core.bound[used]), gain
 
 
 def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -> Estimated:

@@ -10,7 +10,7 @@ N(0, s_j^2), twice the negative logarithm of its posterior probability, up to a 
 Every number of meters is as likely as any other, and every set of one size as any other of that size.
 
 **Tableau.** The sweep operator keeps ``[F + 1 / s^2, y; y', 0]`` pivoted on J, so that the costs of all sets
-that differ by one addition, removal or exchange are read off, O(q) to O(k q); a step is O(q^2). A group of
+that differ by one addition, removal or exchange are read off, O(q) to O(k q); a step is O(q k). A group of
 neighbours is added or removed at once.
 
 References
@@ -24,11 +24,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from math import inf, log
+from math import inf, log, sqrt
 from typing import Self
 
 import numpy as np
-from scipy.linalg import blas, cho_solve, cholesky, lapack
+from scipy.linalg import blas, lapack
 
 from gridsec.arrays import Bools, Floats, Ints, frozen, submatrix
 
@@ -92,7 +92,7 @@ def informed(problem: SearchProblem) -> Bools:
     return np.asarray(problem.F.diagonal()[: problem.meters] > np.finfo(np.float64).tiny)
 
 
-def cost(problem: SearchProblem, chosen: Bools) -> float:
+def cost(problem: SearchProblem, chosen: Bools, share: float = 0.0) -> float:
     """Cost of one set; O(k^3).
 
     Parameters
@@ -101,13 +101,27 @@ def cost(problem: SearchProblem, chosen: Bools) -> float:
         The problem.
     chosen : (q,)
         The set.
+    share
+        As in `costs`.
     """
-    at = np.flatnonzero(chosen)
-    out = penalty(problem, chosen)
-    if at.size:
-        half = cholesky(problem.F[np.ix_(at, at)] + np.diag(problem.std[at] ** -2.0), lower=True)
-        out -= float(problem.y[at] @ cho_solve((half, True), problem.y[at]))
-        out += 2.0 * float(np.log(np.diag(half)).sum() + np.log(problem.std[at]).sum())
+    at, out = np.flatnonzero(chosen), penalty(problem, chosen)
+    if share:
+        out += float(problem.charge.max(initial=0.0))
+    if not at.size:
+        return out
+    meter = at < problem.meters
+    std = np.where(meter, sqrt(1.0 - share), 1.0) * problem.std[at]
+    A = submatrix(problem.F, at, at)
+    A[np.diag_indices(at.size)] += std**-2.0
+    half, failed = lapack.dpotrf(A.T, lower=True, overwrite_a=True, clean=False)
+    if failed:
+        raise np.linalg.LinAlgError("the information of a set is not positive definite")
+    w = np.where(meter, 1.0 / (problem.std[at] * (1.0 - share)), 0.0)
+    own, common = lapack.dtrtrs(half, np.stack([problem.y[at], w]).T, lower=True)[0].T
+    out += 2.0 * float(np.log(half.diagonal() * std).sum()) - float(own @ own)
+    if share:
+        information = np.count_nonzero(meter) / (1.0 - share) - float(common @ common)
+        out += float(common_cost(share, -float(common @ own), information))
     return out
 
 
@@ -118,7 +132,7 @@ def costs(problem: SearchProblem, sets: Bools, share: float = 0.0) -> Floats:
     largest charge besides: an unreported load moves neighbours alike as well. With the posterior mean m and
     covariance G of amounts without the common one, and ``w = 1 / (s (1 - share))`` for k meters, the score
     and the information of the common amount are ``w' m`` and ``k / (1 - share) - w' G w``. A set takes O(n^3)
-    for the n faults in which it differs from those beside it.
+    for the n faults in which it differs from those beside it; up to `FEW` sets have factors of their own.
 
     Parameters
     ----------
@@ -129,6 +143,8 @@ def costs(problem: SearchProblem, sets: Bools, share: float = 0.0) -> Floats:
     share
         Share in common, 0 to 1.
     """
+    if len(sets) <= FEW:
+        return np.array([cost(problem, each, share) for each in sets])
     meters = np.count_nonzero(sets[:, : problem.meters], axis=1)
     out = penalties(problem.meters)[meters] + (problem.charge.max(initial=0.0) if share else 0.0)
     used = np.logical_or.reduce(sets, axis=0)
@@ -140,8 +156,8 @@ def costs(problem: SearchProblem, sets: Bools, share: float = 0.0) -> Floats:
         out[rows] += base.cost - base.penalty[base.count] + log_det - inner[:, 0, 0]
         out[rows] += (sign * (base.size + problem.charge)[at]).sum(axis=1)
         if share:
-            score = inner[:, 0, 1] - base.A[q, q + 1]
-            information = meters[rows] / (1.0 - share) + base.A[q + 1, q + 1] - inner[:, 1, 1]
+            score = inner[:, 0, 1] - base.borders[q, 1]
+            information = meters[rows] / (1.0 - share) + base.borders[q + 1, 1] - inner[:, 1, 1]
             out[rows] += common_cost(share, score, information)
     return np.asarray(out)
 
@@ -205,13 +221,13 @@ def explained(problem: SearchProblem, sets: Bools, weight: Floats, T: Floats) ->
     problem, sets, T = among(problem, used), sets[:, used], T[:, used]
     q, mean, variance = problem.y.size, np.zeros((len(sets), len(T))), np.zeros(len(T))
     for base, rows, at, inside in _tableaus(problem, sets):
-        J = np.flatnonzero(base.chosen)
-        U = np.where(base.chosen, 0.0, T) - T[:, J] @ base.A[J, :q]
+        J, v = base.order, base.borders[:, 0]
+        U = np.where(base.chosen, 0.0, T) - T[:, J] @ base.beside[:q].T
         inverse = np.linalg.inv(base.within(at, inside)) * (inside[:, :, None] & inside[:, None, :])
         along, turn = np.zeros((rows.size, q)), np.zeros((q, q))
-        np.add.at(along, (np.arange(rows.size)[:, None], at), np.vecdot(inverse, base.A[at, q][:, None, :]))
+        np.add.at(along, (np.arange(rows.size)[:, None], at), np.vecdot(inverse, v[at][:, None, :]))
         np.add.at(turn, (at[:, :, None], at[:, None, :]), weight[rows, None, None] * inverse)
-        mean[rows] = T[:, J] @ base.A[J, q] + along @ U.T
+        mean[rows] = T[:, J] @ v[J] + along @ U.T
         variance += weight[rows].sum() * (U[:, J] * T[:, J]).sum(axis=1) + ((U @ turn) * U).sum(axis=1)
     return mean, variance
 
@@ -273,6 +289,10 @@ def _bordered(A: Floats, v: Floats) -> Floats:
 
 TOGGLED = 16
 """Faults in which a set differs from another one up to which its cost is that of a few toggles, 1."""
+FEW = 8
+"""Number of sets up to which each has a factor of its own, 1: a tableau takes ten times as long as one."""
+ROOM = 16
+"""Columns of a tableau that are free for more faults, 1."""
 _HUGE = 1e200
 """Above all ``v' A^-1 v``."""
 
@@ -305,6 +325,9 @@ def mean_amounts(problem: SearchProblem, chosen: Bools) -> Floats:
 class Tableau:
     """Sweep tableau of one problem, pivoted on a set.
 
+    Of the tableau A only the diagonal, the borders and the columns of chosen faults are kept, O(q k): all
+    other entries follow from these, ``A_ij = F_ij - A_iJ F_Jj``.
+
     Parameters
     ----------
     problem
@@ -314,39 +337,51 @@ class Tableau:
     """
 
     def __init__(self, problem: SearchProblem, *borders: Floats) -> None:
-        q, rows = problem.y.size, np.stack([problem.y, *borders])
+        q, self.rows = problem.y.size, np.stack([problem.y, *borders])
+        r = len(self.rows)
         self.problem, self.penalty = problem, penalties(problem.meters)
-        self.A = np.zeros((q + len(rows), q + len(rows)), order="F")
-        self.A.T[:q, :q] = problem.F
-        self.A[np.arange(q), np.arange(q)] += problem.std**-2.0
-        self.A[q:, :q], self.A[:q, q:] = rows, rows.T
+        self.prior = problem.std**-2.0
+        self.diagonal = problem.F.diagonal() + self.prior
+        # Columns of the borders, then those of the faults in `order`; the rest is room for more.
+        self.columns = np.zeros((q + r, r + ROOM), order="F")
+        self.columns[:q, :r] = self.rows.T
+        self.order = np.zeros(0, dtype=np.intp)
         self.chosen = np.zeros(q, dtype=np.bool_)
         self.barred = np.zeros(q, dtype=np.bool_)
         self.cost = 0.0
         self.size = 2.0 * np.log(problem.std)
 
     def pivot(self, chosen: Bools) -> Self:
-        """The same, pivoted on a set in place of none; O(q^2 k).
+        """The same, pivoted on a set in place of none; O(q k^2).
 
         Parameters
         ----------
         chosen : (q,)
             The set.
         """
-        J, q = np.flatnonzero(chosen), chosen.size
+        J, q, r = np.flatnonzero(chosen), chosen.size, len(self.rows)
         if not J.size:
             return self
-        columns = self.A[:, J]
-        half, _ = lapack.dpotrf(columns[J], lower=True, clean=True)
-        white = blas.dtrsm(1.0, half, columns, side=1, lower=1, trans_a=1)
-        beside = blas.dtrsm(1.0, half, white, side=1, lower=1)
+        beside = np.empty((q + r, J.size), order="F")
+        beside.T[:, :q], beside[q:] = self.problem.F.take(J, axis=0), self.rows[:, J]
+        A = beside[J]
+        A[np.diag_indices(J.size)] += self.prior[J]
+        half, _ = lapack.dpotrf(A, lower=True, clean=True)
+        white = blas.dtrsm(1.0, half, beside, side=1, lower=1, trans_a=1, overwrite_b=1)
+        inner = white[q:]
+        self.columns = np.zeros((q + r, r + J.size + ROOM), order="F")
+        borders = self.columns[:, :r]
+        borders[:q] = self.rows.T
+        borders -= white @ inner.T
+        self.diagonal -= np.vecdot(white[:q], white[:q])
+        self.cost = 2.0 * float(np.log(half.diagonal()).sum()) - float(inner[0] @ inner[0])
+        self.cost += float(self.size[J].sum() + self.problem.charge[J].sum())
+        beside = blas.dtrsm(1.0, half, white, side=1, lower=1, overwrite_b=1)
         inverse, _ = lapack.dpotri(half, lower=True)
         beside[J] = -np.tril(inverse) - np.tril(inverse, -1).T
-        self.A -= white @ white.T
-        self.A[:, J], self.A[J] = beside, beside.T
-        self.cost = 2.0 * float(np.log(half.diagonal()).sum()) - float(white[q] @ white[q])
-        self.cost += float(self.size[J].sum() + self.problem.charge[J].sum())
-        self.chosen = chosen.copy()
+        self.columns[:, r : r + J.size], borders[J] = beside, beside[q:].T
+        self.diagonal[J] = -inverse.diagonal()
+        self.order, self.chosen = J, chosen.copy()
         self.cost += float(self.penalty[self.count])
         return self
 
@@ -354,9 +389,39 @@ class Tableau:
         """A tableau that can be changed without changing this one."""
         out = object.__new__(type(self))
         out.problem, out.penalty, out.size = self.problem, self.penalty, self.size
-        out.A, out.chosen, out.cost = self.A.copy(order="F"), self.chosen.copy(), self.cost
-        out.barred = self.barred.copy()
+        out.rows, out.prior, out.order = self.rows, self.prior, self.order
+        out.columns, out.diagonal = self.columns.copy(order="F"), self.diagonal.copy()
+        out.chosen, out.barred, out.cost = self.chosen.copy(), self.barred.copy(), self.cost
         return out
+
+    @property
+    def beside(self) -> Floats:
+        """Columns of the chosen faults, in their order, (q + r, k)."""
+        r = len(self.rows)
+        return self.columns[:, r : r + self.order.size]
+
+    @property
+    def borders(self) -> Floats:
+        """Columns of the scores and of the rows beside them, (q + r, r)."""
+        return self.columns[:, : len(self.rows)]
+
+    def of(self, out: Ints) -> Floats:
+        """Rows of chosen faults, (n, q)."""
+        at = np.empty(self.chosen.size, dtype=np.intp)
+        at[self.order] = np.arange(self.order.size)
+        return self.beside[: self.chosen.size].T.take(at[out], axis=0)
+
+    def part(self, at: Ints) -> Floats:
+        """Entries between some faults, (n, n); O(n^2 k)."""
+        F, inside = self.problem.F, self.chosen[at]
+        A = submatrix(F, at, at)
+        A[np.diag_indices(at.size)] += self.prior[at]
+        if self.order.size:
+            A -= self.beside[at] @ submatrix(F, self.order, at)
+        if inside.any():
+            A[inside] = self.of(at[inside])[:, at]
+            A[:, inside] = A[inside].T
+        return A
 
     @property
     def whole(self) -> float:
@@ -371,12 +436,11 @@ class Tableau:
     @property
     def amount(self) -> Floats:
         """Posterior means of the amounts of chosen faults, (q,); not defined for others."""
-        q = self.chosen.size
-        return self.A[:q, q]
+        return self.columns[: self.chosen.size, 0]
 
     def changes(self) -> Floats:
         """Change of the cost by toggling each fault, (q,); inf where it is barred or would be impossible."""
-        a = self.A.diagonal()[: self.chosen.size]
+        a = self.diagonal
         out, v = self.steps()
         impossible = ~self.chosen & (np.abs(v) > self.problem.bound * np.abs(a))
         sign = np.where(self.chosen, -1.0, 1.0)
@@ -384,14 +448,13 @@ class Tableau:
 
     def steps(self) -> tuple[Floats, Floats]:
         """Change of the cost by toggling each fault, and its amount times its pivot, (q,)."""
-        q, k, p = self.chosen.size, self.count, self.problem.meters
-        a, v = self.A.diagonal()[:q], self.A[:q, q]
+        k, p, a, v = self.count, self.problem.meters, self.diagonal, self.columns[: self.chosen.size, 0]
         sign = np.where(self.chosen, -1.0, 1.0)
-        out = -v * v / a + np.where(self.chosen, np.log(np.abs(a)) - self.size, np.log(np.abs(a)) + self.size)
+        out = np.log(np.abs(a)) + sign * (self.size + self.problem.charge) - v * v / a
         up = self.penalty[min(k + 1, p)] - self.penalty[k]
         down = self.penalty[max(k - 1, 0)] - self.penalty[k]
         out[:p] += np.where(self.chosen[:p], down, up)
-        return out + sign * self.problem.charge, v
+        return out, v
 
     def exchanges(self, out: Ints) -> Floats:
         """Change of the cost by exchanging chosen faults `out` for others, (k, q); inf for itself.
@@ -401,35 +464,55 @@ class Tableau:
         out : (k,)
             Chosen faults.
         """
+        return np.where(self.chosen, inf, self.seconds(out))
+
+    def seconds(self, out: Ints) -> Floats:
+        """Change of the cost by removing chosen faults `out` and toggling others, (k, q); inf for itself.
+
+        Parameters
+        ----------
+        out : (k,)
+            Chosen faults.
+        """
         with np.errstate(divide="ignore", invalid="ignore"):
             both, pull, pivot = self.pairs(out)
-            impossible = np.abs(pull) > self.problem.bound * np.abs(pivot)
-        return np.where(self.chosen | self.barred | impossible | ~(pivot > 0.0), inf, both)
+            impossible = self.barred | (np.abs(pull) > self.problem.bound * np.abs(pivot))
+        both[(impossible & ~self.chosen) | ~(np.where(self.chosen, -pivot, pivot) > 0.0)] = inf
+        both[np.arange(out.size), out] = inf
+        return both
 
     def pairs(self, out: Ints) -> tuple[Floats, Floats, Floats]:
-        """Change of the cost by exchanges, the amount of the new one times its pivot, and that, (k, q)."""
+        """Change of the cost by such pairs, the amount of the new one times its pivot, and that, (k, q)."""
         p, q, k = self.problem.meters, self.chosen.size, self.count
-        a, v = self.A.diagonal()[:q], self.A[:q, q]
-        rows = self.A[out, :q] / a[out][:, None]
-        pivot = a - rows * self.A[out, :q]
+        a, v, own = self.diagonal, self.columns[:q, 0], self.of(out)
+        rows = own / a[out][:, None]
+        pivot = a - rows * own
         pull = v - rows * v[out][:, None]
         first = -(v[out] ** 2) / a[out] + np.log(-a[out]) - self.size[out] - self.problem.charge[out]
-        both = first[:, None] - pull**2 / pivot + np.log(pivot) + self.size + self.problem.charge
-        meter = np.arange(q) < p
-        count = k - meter[out][:, None] + meter
+        sign, meter = np.where(self.chosen, -1, 1), np.arange(q) < p
+        both = first[:, None] - pull**2 / pivot + np.log(np.abs(pivot))
+        both += sign * (self.size + self.problem.charge)
+        count = k - meter[out][:, None] + sign * meter
         both += self.penalty[np.minimum(count, p)] - self.penalty[k]
         return both, pull, pivot
 
-    def within(self, members: Ints, inside: Bools) -> Floats:
-        """Blocks of the tableau for some sets, (k, g, g), filled up by the identity; as in `toggled`."""
-        n = np.arange(members.shape[1])
-        A = self.A[members[:, :, None], members[:, None, :]] * (inside[:, :, None] & inside[:, None, :])
+    def within(self, members: Ints, inside: Bools, block: Floats | None = None) -> Floats:
+        """Blocks of the tableau for some sets, (k, g, g), filled up by the identity; as in `toggled`.
+
+        block: entries between the first faults, all members among them; None: computed here.
+        """
+        n, place = np.arange(members.shape[1]), members
+        if block is None:
+            every, place = np.unique(members, return_inverse=True)
+            block = self.part(every)
+        A = block[place[:, :, None], place[:, None, :]]
+        A *= inside[:, :, None] & inside[:, None, :]
         A[:, n, n] += ~inside
         return A
 
     def block(self, members: Ints, inside: Bools) -> tuple[Floats, Floats]:
         """``log |det A|`` (k,) and ``v A^-1 v'`` (k, r, r) of these blocks and the rows v of the borders."""
-        A, v = self.within(members, inside), self.A[self.chosen.size :, members].transpose(1, 0, 2)
+        A, v = self.within(members, inside), self.borders[members].transpose(0, 2, 1)
         v = v * inside[:, None, :]
         return np.linalg.slogdet(A)[1], v @ np.linalg.solve(A, v.transpose(0, 2, 1))
 
@@ -462,25 +545,47 @@ class Tableau:
             self.toggle(j)
 
     def toggle(self, j: int) -> None:
-        """Add a fault to the set, or remove it; O(q^2).
+        """Add a fault to the set, or remove it; O(q k).
 
         Parameters
         ----------
         j
             The fault.
         """
-        k, column, d = self.count, self.A[:, j].copy(), self.A[j, j]
-        self.A = blas.dger(-1.0 / d, column, column, a=self.A, overwrite_a=True)
-        pivot = column / (-d if self.chosen[j] else d)
-        self.A[j] = self.A[:, j] = pivot
-        self.A[j, j] = -1.0 / d
-        size = log(abs(d)) + (-self.size[j] if self.chosen[j] else self.size[j])
-        added = -1 if self.chosen[j] else 1
-        self.cost += size - column[self.chosen.size] ** 2 / d + added * self.problem.charge[j]
-        self.chosen[j] = not self.chosen[j]
+        k, q, r, n = self.count, self.chosen.size, len(self.rows), self.order.size
+        column, inside = self._column(j), bool(self.chosen[j])
+        d = float(column[j])
+        if r + n == self.columns.shape[1]:
+            self.columns = np.hstack([self.columns, np.zeros((q + r, n + ROOM))])
+            self.columns = np.asfortranarray(self.columns)
+        at, live = np.concatenate([np.arange(q, q + r), self.order]), self.columns[:, : r + n]
+        blas.dger(-1.0 / d, column, column[at], a=live, overwrite_a=True)
+        self.diagonal -= column[:q] ** 2 / d
+        pivot = column / (-d if inside else d)
+        pivot[j] = self.diagonal[j] = -1.0 / d
+        live[j] = pivot[at]
+        size = log(abs(d)) + (-self.size[j] if inside else self.size[j])
+        self.cost += size - column[q] ** 2 / d + (-1 if inside else 1) * self.problem.charge[j]
+        if inside:
+            place = int(np.flatnonzero(self.order == j)[0])
+            live[:, r + place] = live[:, -1]
+            self.order = np.where(self.order == j, self.order[-1], self.order)[:-1]
+        else:
+            self.columns[:, r + n] = pivot
+            self.order = np.append(self.order, j)
+        self.chosen[j] = not inside
         self.cost += self.penalty[self.count] - self.penalty[k]
 
-    def group(self, members: Ints, inside: Bools) -> Floats:
+    def _column(self, j: int) -> Floats:
+        """Column of one fault, (q + r,)."""
+        if self.chosen[j]:
+            return np.asarray(self.beside[:, self.order == j][:, 0])
+        column = np.concatenate([self.problem.F[j], self.rows[:, j]])
+        column -= self.beside @ column[self.order]
+        column[self.order], column[j] = self.beside[j], self.diagonal[j]
+        return column
+
+    def group(self, members: Ints, inside: Bools, block: Floats | None = None) -> Floats:
         """Change of the cost by adding the first n meters of sequences, (k, g); inf for one meter or none.
 
         The factor of a sequence contains those of its beginnings. Chosen meters stay chosen.
@@ -489,26 +594,27 @@ class Tableau:
         ----------
         members, inside : (k, g)
             The sequences, filled up to the same length, and where they are members.
+        block
+            As in `within`.
         """
-        q = self.chosen.size
-        return self.beginnings(members, inside, self.A[:q, q : q + 1].T)[0]
+        return self.beginnings(members, inside, block, self.columns[: self.chosen.size, :1].T)[0]
 
-    def beginnings(self, members: Ints, inside: Bools, rows: Floats) -> tuple[Floats, Bools, Floats]:
+    def beginnings(
+        self, members: Ints, inside: Bools, block: Floats | None, rows: Floats
+    ) -> tuple[Floats, Bools, Floats]:
         """The same, new members (k, g), and the products of rows (r, q) over the new members, (k, r, r, g).
 
         Parameters
         ----------
-        members, inside : (k, g)
-            The sequences.
+        members, inside, block
+            As in `group`.
         rows : (r, q)
             The scores, and other rows beside the tableau.
         """
         p, free, k = self.problem.meters, inside & ~self.chosen[members], self.count
         count = np.cumsum(free, axis=1)
-        both = free[:, :, None] & free[:, None, :]
-        A = np.where(both, self.A[members[:, :, None], members[:, None, :]], 0.0)
-        A[:, np.arange(members.shape[1]), np.arange(members.shape[1])] += ~free
-        log_det, inner = _fits(A, rows[:, members].transpose(1, 0, 2) * free[:, None])
+        v = rows[:, members].transpose(1, 0, 2) * free[:, None]
+        log_det, inner = _fits(self.within(members, free, block), v)
         size = np.cumsum(free * self.size[members], axis=1)
         out = log_det + size - inner[:, 0, 0] + self.penalty[np.minimum(k + count, p)] - self.penalty[k]
         barred = np.logical_or.accumulate(free & self.barred[members], axis=1)

@@ -23,15 +23,24 @@ its phase.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from math import inf
 
 import numpy as np
-from scipy.linalg import lapack
 
-from gridsec.arrays import Bools, Ints, any_of, submatrix
-from gridsec.estimators.modal.costs import SearchProblem, informed, mean_likelihood
-from gridsec.estimators.modal.laterals import clusters, coded
+from gridsec.arrays import Bools, Floats, any_of
+from gridsec.estimators.modal.alike import Alike
+from gridsec.estimators.modal.costs import (
+    SearchProblem,
+    Tableau,
+    among,
+    common_cost,
+    informed,
+    mean_likelihood,
+    padded,
+)
+from gridsec.estimators.modal.laterals import clusters, coded, similar
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.search import ALIKE, Identification, costs_of, identified
 
@@ -97,29 +106,25 @@ def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iter
                 )
                 more = float(both[1] - both[0] + problem.charge[image].sum() - problem.charge[chosen].sum())
             yield image, max(more, 0.0) + _apart(likelihood, chosen & image, column)
-    done = set[bytes]()
     # What lies outside of a lateral is one, too: that of more meters than are promised has no image.
     outside = ~near.laterals & read
     few = np.count_nonzero(outside ^ chosen[:p], axis=1) <= near.most
-    for lateral in np.vstack([near.laterals & read, outside[few]]):
-        accused, others = lateral & chosen[:p], lateral & ~chosen[:p]
-        key = others.tobytes() + accused.tobytes()
-        if key in done or not any_of(accused) or not any_of(others):
-            continue
-        done.add(key)
-        rest = chosen.copy()
-        rest[:p] &= ~lateral
-        own = likelihood(rest, accused)
-        if own - likelihood.own > APART:
-            continue
-        for powers in (True, False) if any_of(rest[p:-b]) else (True,):
-            dropped = 0.0
-            if not powers:
-                dropped, rest = float(problem.charge[p:-b] @ rest[p:-b]), rest.copy()
-                rest[p:-b] = False
-            image = rest.copy()
-            image[:p] |= others
-            yield image, likelihood(rest, others) - min(likelihood.own, own) - dropped
+    laterals = np.vstack([near.laterals & read, outside[few]])
+    sets = np.unique(np.hstack([laterals & ~chosen[:p], laterals & chosen[:p]]), axis=0)
+    sets = sets[sets[:, :p].any(axis=1) & sets[:, p:].any(axis=1)]
+    rest = np.tile(chosen, (len(sets), 1))
+    rest[:, :p] &= ~sets[:, p:]
+    own = likelihood(rest, sets[:, p:])
+    alike = own - likelihood.own <= APART
+    rest, own, others = rest[alike], np.minimum(likelihood.own, own[alike]), sets[alike, :p]
+    for powers in (True, False) if any_of(chosen[p:-b]) else (True,):
+        dropped = 0.0
+        if not powers:
+            dropped = float(problem.charge[p:-b] @ chosen[p:-b])
+            rest[:, p:-b] = False
+        images, more_of = rest.copy(), likelihood(rest, others) - own - dropped
+        images[:, :p] |= others
+        yield from zip(images, more_of.tolist(), strict=True)
 
 
 def _of_phase(chosen: Bools, near: Neighbourhoods, phase: int, read: Bools) -> tuple[Bools | None, Bools]:
@@ -139,58 +144,73 @@ def _of_phase(chosen: Bools, near: Neighbourhoods, phase: int, read: Bools) -> t
 
 def _apart(likelihood: _Likelihood, rest: Bools, column: Bools) -> float:
     """Cost of one amount in place of several, at least 0; infinite for `APART`."""
-    more = likelihood(rest, column) - likelihood.own
-    return max(more, 0.0) if more <= APART else np.inf
+    more = float(likelihood(rest[None], column[None])[0]) - likelihood.own
+    return max(more, 0.0) if more <= APART else inf
 
 
 class _Likelihood:
-    """L of sets near one, (q,), with the priors of the amounts that count for it."""
+    """L of parts of a set (q,) with one more column, with the priors of the amounts that count for the set.
+
+    A column x is a row beside the tableau T of the set. Without the faults A of the set, the score, the
+    information and the pull of x lose ``T_xA T_AA^-1 T_A``, as those of the set do.
+    """
 
     def __init__(self, problem: SearchProblem, chosen: Bools) -> None:
-        self.problem, self.charge = problem, float(problem.charge.max(initial=0.0))
-        shares = {share: self._with(chosen, None, share) for share in (0.0, ALIKE)}
-        least = min(shares.values())
+        self.problem, self.chosen = problem, chosen
+        several = np.count_nonzero(chosen[: problem.meters]) > 1
+        self.shares: tuple[float, ...] = (0.0, ALIKE) if several else (0.0,)
+        few, every = among(problem, chosen), np.ones(int(np.count_nonzero(chosen)), dtype=np.bool_)
+        starts = {share: Alike(few, share) if share else Tableau(few) for share in self.shares}
+        self.tableaus = {share: start.pivot(every) for share, start in starts.items()}
+        own = self._each(chosen[None], np.zeros((1, problem.meters), dtype=np.bool_))
         # A prior that is far worse for the set is so for its images.
-        self.shares = [share for share, one in shares.items() if one <= least + APART]
-        self.own = self._mean(shares)
+        least = own.min() + APART
+        self.shares = tuple(share for share, one in zip(self.shares, own, strict=True) if one[0] <= least)
+        self.own = float(mean_likelihood(own[own[:, 0] <= least])[0])
 
-    def __call__(self, rest: Bools, column: Bools) -> float:
-        """L of the faults `rest` (q,) and of the meters `column` (p,) with one amount."""
-        return self._mean({share: self._with(rest, column, share) for share in self.shares})
+    def __call__(self, rest: Bools, columns: Bools) -> Floats:
+        """L of faults `rest` (n, q) and of meters `columns` (n, p) with one amount, (n,)."""
+        return mean_likelihood(self._each(rest, columns))
 
-    def _mean(self, each: Mapping[float, float]) -> float:
-        """L of the mean of the likelihoods with the priors that count."""
-        return float(mean_likelihood(np.array([each[share] for share in self.shares])))
+    def _each(self, rest: Bools, columns: Bools) -> Floats:
+        """L with each prior that counts, (s, n); one meter has no amount in common with others."""
+        several = np.count_nonzero(rest[:, : self.problem.meters], axis=1) > 1
+        shares = {share for share in self.shares if several.any()}
+        each = {s: self._with(rest, columns, s) for s in (shares if several.all() else shares | {0.0})}
+        plain = each.get(0.0, np.zeros(len(rest)))
+        return np.stack([np.where(several, each.get(share, plain), plain) for share in self.shares])
 
-    def _with(self, rest: Bools, column: Bools | None, share: float) -> float:
-        at = np.flatnonzero(rest)
-        if np.count_nonzero(at < self.problem.meters) < 2:
-            share = 0.0
-        return _likelihood(self.problem, at, column, share) + (self.charge if share else 0.0)
-
-
-def _likelihood(problem: SearchProblem, at: Ints, column: Bools | None, share: float = 0.0) -> float:
-    """L of faults `at`, their meters with a share of the variance in common, and of one for `column` (p,)."""
-    n, y, std = at.size, problem.y[at], problem.std[at]
-    F = submatrix(problem.F, at, at)
-    if column is not None:
-        together = np.flatnonzero(column)
-        side, inner = problem.F[together].sum(axis=0), F
-        F = np.empty((n + 1, n + 1))
-        F[:n, :n], F[n, :n], F[:n, n], F[n, n] = inner, side[at], side[at], side[together].sum()
-        y, std = np.append(y, problem.y[together].sum()), np.append(std, problem.std[0])
-    if not y.size:
-        return 0.0
-    pull, A = std * y, std[:, None] * F * std
-    if share:
-        # With the root R of the prior's correlation: R y and R F R.
-        k = np.count_nonzero(at < problem.meters)
-        own = np.sqrt(1.0 - share)
-        common = (np.sqrt(1.0 - share + share * k) - own) / k
-        for one in (pull, A, A.T):
-            one[:k] = own * one[:k] + common * one[:k].sum(axis=0)
-    A[np.diag_indices(y.size)] += 1.0
-    half, found, failed = lapack.dposv(A, pull, lower=True)
-    if failed:
-        raise np.linalg.LinAlgError(failed)
-    return float(2.0 * np.log(half.diagonal()).sum() - pull @ found)
+    def _with(self, rest: Bools, columns: Bools, share: float) -> Floats:
+        """L with a share of the variance of the meters in common, (n,)."""
+        problem, tableau, p = self.problem, self.tableaus[share], self.problem.meters
+        q, r, s2 = len(tableau.order), len(tableau.rows), float(problem.std[0]) ** 2
+        lacks, side = ~rest[:, self.chosen], columns @ problem.F[:p]
+        own = side[:, self.chosen]
+        x = -own @ tableau.beside[:q]
+        # Entries of the column with the borders and with itself.
+        beside = -x @ tableau.rows.T
+        beside[:, 0] += columns @ problem.y[:p]
+        pivot = 1.0 / s2 + (side[:, :p] * columns).sum(axis=1) - np.vecdot(x, own)
+        meters = np.count_nonzero(rest[:, :p], axis=1)
+        out = np.full(len(rest), tableau.cost - float(tableau.penalty[tableau.count]))
+        out -= tableau.problem.charge.sum() + lacks @ tableau.size
+        information = meters / (1.0 - share) + tableau.borders[q + r - 1, r - 1]
+        score = np.full(len(rest), -tableau.borders[q, r - 1])
+        for places in similar(np.count_nonzero(lacks, axis=1).tolist()):
+            at, inside = padded(lacks[places])
+            A, v = tableau.within(at, inside), tableau.borders[at].transpose(0, 2, 1)
+            v = np.concatenate([v, np.take_along_axis(x[places], at, axis=1)[:, None]], axis=1)
+            v *= inside[:, None, :]
+            inner = v @ np.linalg.solve(A, v.transpose(0, 2, 1))
+            out[places] += np.linalg.slogdet(A)[1] - inner[:, 0, 0]
+            score[places] += inner[:, 0, r - 1]
+            information[places] -= inner[:, r - 1, r - 1]
+            beside[places] -= inner[:, :r, r]
+            pivot[places] -= inner[:, r, r]
+        pull = beside[:, 0]
+        out += np.log(s2 * pivot) - pull * pull / pivot
+        if share:
+            left = beside[:, 1]
+            score, information = score + left * pull / pivot, information - left * left / pivot
+            out += common_cost(share, score, information) + problem.charge.max(initial=0.0)
+        return np.asarray(out)

@@ -259,6 +259,11 @@ class Modes:
         return self.model.noise(self.at)
 
     @cached_property
+    def precision(self) -> Floats:
+        """Inverse of `noise`, ``U U'``, (t, t)."""
+        return self.U @ self.U.T
+
+    @cached_property
     def covariance_w(self) -> Floats:
         """Covariance of w at the members, (t, t)."""
         return (self.back * self.varying) @ self.back.T

@@ -26,7 +26,7 @@ from gridsec.estimators.modal import signatures
 from gridsec.estimators.modal.detector import Detector
 from gridsec.estimators.modal.filter import FilterState, Full, Innovation, Interval
 from gridsec.estimators.modal.model import Modes
-from gridsec.estimators.modal.signatures import RAMP_S, Joint, Onsets
+from gridsec.estimators.modal.signatures import RAMP_S, Joint, Onsets, Scored
 from gridsec.estimators.modal.static import Static
 
 HALF = 64
@@ -59,6 +59,11 @@ class Suspected:
     shift: Floats = field(repr=False)
     score: Floats = field(repr=False)
     information: Floats = field(repr=False)
+
+    @property
+    def scored(self) -> Scored:
+        """Scores and information of the members."""
+        return Scored(self.score, self.information)
 
     def joint(self, modes: Modes) -> Joint:
         """The same in the modes."""
@@ -157,17 +162,18 @@ def replayed(modes: Modes, history: History, onsets: Onsets, rows: Sequence[int]
     onsets, rows
         The onsets of the detector after the last reading, and the rows.
     """
-    count = len(history.readings)
-    kept, (state, known, *_) = history.until(max(0, count - max(int(onsets.age[row]) for row in rows)))
-    t, full = state.t, exact.expanded(modes, state, known) if state.full is None else state.full
+    count, oldest = len(history.readings), max(int(onsets.age[row]) for row in rows)
+    kept, (state, known, *_) = history.until(max(0, count - oldest))
     out, first = {row: begun(modes, row, bool(onsets.ramp[row])) for row in rows}, len(kept.readings)
-    for k, (now, m, seen, unknown, jump) in enumerate(history.readings[first:], first):
-        gap = Interval(now - t, jump)
-        full, innovation = exact.updated(modes, full, gap, m, seen, unknown)
+    for k, (t, m, seen, unknown, jump) in enumerate(history.readings[first:], first):
+        if state.full is None and oldest >= count - k:
+            state = replace(state, full=exact.expanded(modes, state, known))
+        state, known, update = exact.step(
+            modes, state, known, t, m, seen, stay=True, unknown=unknown, jump=jump
+        )
         for row in rows:
-            if onsets.age[row] >= count - k:
-                out[row] = follow(modes, out[row], innovation, gap)
-        t = now
+            if update.exact is not None and onsets.age[row] >= count - k:
+                out[row] = follow(modes, out[row], update.exact, update.gap)
     return tuple(out.values())
 
 

@@ -44,7 +44,7 @@ from gridsec.estimators.modal import full as exact
 from gridsec.estimators.modal.filter import FilterState, Interval, Update
 from gridsec.estimators.modal.model import REPORTED_S, Modes
 from gridsec.estimators.modal.replay import History, Suspected
-from gridsec.estimators.modal.signatures import Joint, Onsets
+from gridsec.estimators.modal.signatures import Joint, Onsets, Scored
 from gridsec.estimators.modal.static import Static
 
 UNREST = (1.0, 30.0)
@@ -141,6 +141,17 @@ class Rival:
         if self.filter.full is not None:
             return self.sum
         return self.sum + _of_theta(self.modes, self.static) - self.known
+
+    @property
+    def level(self) -> float:
+        """Level u of the onset at the last tick."""
+        return float(self.onsets.level[0]) if self.suspected is None else self.suspected.level
+
+    def scored(self) -> Scored:
+        """Scores and information of the members at the onset."""
+        if self.suspected is not None:
+            return self.suspected.scored
+        return signatures.scored(self.modes, self.onsets, self.static, 0)
 
     def joint(self) -> Joint:
         """Joint scores of the onset."""

@@ -26,7 +26,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import inf, log
 from typing import TypeVar
@@ -161,9 +161,9 @@ def _exchanged(tableau: Tableau) -> bool:
 
 def _grouped(tableau: Tableau, groups: Groups) -> bool:
     """Add the rest of the best group, if one helps."""
-    best, least = None, -GAIN
+    best, least, block = None, -GAIN, tableau.part(np.arange(tableau.problem.meters))
     for members, inside, ends in groups:
-        change = np.where(ends, tableau.group(members, inside), inf)
+        change = np.where(ends, tableau.group(members, inside, block), inf)
         k, n = np.unravel_index(int(change.argmin()), change.shape)
         if change[k, n] < least:
             best, least = members[k, : n + 1], float(change[k, n])
@@ -301,17 +301,26 @@ def _explored(
         only = descend(only, batches)
         keep(only)
         _neighbours(only, found)
-    for j in np.flatnonzero(best.chosen[: problem.meters]):
-        rival = best.copy()
-        rival.bar(int(j))
-        if rival.cost + min(0.0, float(rival.changes().min())) < best.cost + FAR:
-            keep(descend(rival, batches))
+    for rival in _without_each(best, best.cost + FAR):
+        keep(descend(rival, batches))
     likely = sorted((each, key) for key, each in found.items() if each < best.cost + NEAR)
     for _, key in likely[: EXPANDED + 1]:
         if key != best.chosen.tobytes():
             _neighbours(_at(problem, np.frombuffer(key, dtype=np.bool_)), found, UNLIKELY)
     _with_amounts_alike(problem, found, one_amount)
     return found
+
+
+def _without_each(best: AnyTableau, limit: float) -> Iterator[AnyTableau]:
+    """Tableaus without each meter of a set that are below a limit, alone or with one more change."""
+    out = np.flatnonzero(best.chosen[: best.problem.meters])
+    if not out.size:
+        return
+    least = np.minimum(best.changes()[out], best.seconds(out).min(axis=1))
+    for j in out[best.whole + least < limit]:
+        rival = best.copy()
+        rival.bar(int(j))
+        yield rival
 
 
 def _nearly_alike(best: Tableau, groups: Groups, whole: Floats, read: Bools) -> Bools:
@@ -356,12 +365,9 @@ def _beside_alike(end: Alike, groups: Groups) -> Bools:
     limit = end.whole - 2.0 * log(UNLIKELY)
     found = {end.chosen.tobytes(): end.whole}
     _neighbours(end, found, UNLIKELY)
-    for j in np.flatnonzero(end.chosen[: end.problem.meters]):
-        rival = end.copy()
-        rival.bar(int(j))
-        if rival.whole + min(0.0, float(rival.changes().min())) < limit:
-            descend(rival, groups)
-            found.setdefault(rival.chosen.tobytes(), rival.whole)
+    for rival in _without_each(end, limit):
+        descend(rival, groups)
+        found.setdefault(rival.chosen.tobytes(), rival.whole)
     keys = sorted(found, key=lambda key: found[key])[:SOME]
     return np.stack([np.frombuffer(key, dtype=np.bool_) for key in keys])
 
@@ -466,20 +472,18 @@ _FLIPS = 4
 
 def _neighbours(best: Tableau, found: dict[bytes, float], least: float = BELIEVED) -> None:
     """Add the sets that differ from the best by one addition, removal or exchange, if they weigh anything."""
-    limit = min(found.values()) - 2.0 * log(least)
-    whole, change = best.whole, best.changes()
-    for j in np.flatnonzero(whole + change < limit):
-        chosen = best.chosen.copy()
-        chosen[j] = not chosen[j]
-        found.setdefault(chosen.tobytes(), whole + float(change[j]))
-    out = np.flatnonzero(best.chosen)
-    if not out.size:
-        return
-    both = best.exchanges(out)
-    for i, j in zip(*np.nonzero(whole + both < limit), strict=True):
-        chosen = best.chosen.copy()
-        chosen[out[i]], chosen[j] = False, True
-        found.setdefault(chosen.tobytes(), whole + float(both[i, j]))
+    limit = min(found.values()) - 2.0 * log(least) - best.whole
+    change, out = best.changes(), np.flatnonzero(best.chosen)
+    one = np.flatnonzero(change < limit)
+    both = best.exchanges(out) if out.size else np.zeros((0, change.size))
+    i, j = np.nonzero(both < limit)
+    sets = np.tile(best.chosen, (one.size + j.size, 1))
+    rows = np.arange(one.size, len(sets))
+    sets[np.arange(one.size), one] ^= True
+    sets[rows, out[i]], sets[rows, j] = False, True
+    more = np.concatenate([change[one], both[i, j]]) + best.whole
+    for chosen, each in zip(sets, more.tolist(), strict=True):
+        found.setdefault(chosen.tobytes(), each)
 
 
 def costs_of(found: Identification) -> list[dict[bytes, float]]:

@@ -44,9 +44,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import blas
+from scipy.linalg import blas, lapack
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, submatrix
 from gridsec.estimators.modal.filter import Update
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.static import FEW, Static, current, of_busbar
@@ -352,6 +352,106 @@ class Joint:
         return self.score @ W, W.T @ self.information @ W
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class InModes:
+    """Scores and information of one onset in the modes, ``diag(own) - side cov side'``.
+
+    Attributes
+    ----------
+    U : (t, t)
+        As in `Modes`.
+    score, own : (t,), (t,)
+        y, and the information without the directions.
+    side, cov : (t, r), (r, r)
+        Regression on the directions, and the covariance of these.
+    """
+
+    U: Floats = field(repr=False)
+    score: Floats
+    own: Floats
+    side: Floats
+    cov: Floats
+
+    def times(self, W: Floats) -> Floats:
+        """Product of the information with columns in the modes, (t, k)."""
+        return np.asarray(self.own[:, None] * W - self.side @ (self.cov @ (self.side.T @ W)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scored:
+    """Scores and information of faults of the t members together, at one onset: `Joint` at the members.
+
+    Attributes
+    ----------
+    score, information : (t,), (t, t)
+        y and F of the members.
+    in_modes
+        The same in the modes, where no reading is missing: columns of many members cancel there less.
+    """
+
+    score: Floats
+    information: Floats = field(repr=False)
+    in_modes: InModes | None = field(default=None, repr=False)
+
+    def of(self, columns: Floats, W: Floats) -> tuple[Floats, Floats, Floats]:
+        """Scores (k,) of columns, their information with the members (t, k), and with each other (k, k).
+
+        Parameters
+        ----------
+        columns, W : (t, k)
+            The columns at the members, and in the modes.
+        """
+        if self.in_modes is None:
+            side = self.information @ columns
+            return self.score @ columns, side, columns.T @ side
+        side = self.in_modes.times(W)
+        return self.in_modes.score @ W, self.in_modes.U @ side, W.T @ side
+
+    def misfit(self, precision: Floats) -> float:
+        """Cost of faults of all members, up to a constant; O(t^3).
+
+        Parameters
+        ----------
+        precision : (t, t)
+            Inverse of the prior covariance of their amounts.
+        """
+        half, _ = lapack.dpotrf(self.information + precision, lower=True, overwrite_a=True)
+        white, _ = lapack.dtrtrs(half, self.score, lower=True)
+        return 2.0 * float(np.log(half.diagonal()).sum()) - float(white @ white)
+
+    def beside(self, unknown: Floats) -> tuple[Scored, float]:
+        """The same with unknown errors integrated out, and the gain of evidence by these.
+
+        With scores y_n and information F_n of the directions n, whose amounts are N(0, 1),
+
+            M = F_nn + 1,  y - F_n M^-1 y_n,  F - F_n M^-1 F_n',  gain = (y_n' M^-1 y_n - log det M) / 2
+
+        Parameters
+        ----------
+        unknown : (t, k)
+            Directions of the residuals, times the standard deviations of their amounts.
+        """
+        side = self.information @ unknown
+        half, _ = lapack.dpotrf(unknown.T @ side + np.eye(unknown.shape[1]), lower=True, clean=True)
+        rows = np.column_stack([side.T, self.score @ unknown])
+        white, _ = lapack.dtrtrs(half, rows, lower=True)
+        F, y = white[:, :-1], white[:, -1]
+        gain = 0.5 * float(y @ y) - float(np.log(half.diagonal()).sum())
+        return Scored(self.score - y @ F, self.information - F.T @ F), gain
+
+
+def scored(modes: Modes, onsets: Onsets, static: Static, row: int) -> Scored:
+    """Scores and information at the members of one row; as `joint`."""
+    score, U, own = onsets.score[row], modes.U, onsets.information[row]
+    side, cov = np.zeros((own.size, 0)), np.zeros((0, 0))
+    if modes.sign.size:
+        score = score - onsets.cross[row] * static.constant
+        side, cov = onsets.cross[row][:, None] * modes.directions, current(modes, static).cov
+    of_members = U @ side
+    information = (U * own) @ U.T - of_members @ cov @ of_members.T
+    return Scored(U @ score, information, InModes(U, score, own, side, cov))
+
+
 def joint(modes: Modes, onsets: Onsets, static: Static, row: int) -> Joint:
     """Joint scores of one row, all directions integrated out; exact where no reading is missing; O(t^2 r).
 
@@ -387,12 +487,34 @@ class Columns:
         Prior standard deviation of each amount.
     members, powers
         Numbers of columns of members and of powers; the rest are phases of the busbar.
+    beside : (t, q - members)
+        Columns of powers and busbar at the members.
     """
 
     W: Floats
     std: Floats
     members: int
     powers: int
+    beside: Floats
+
+    def of(self, scored: Scored, used: Bools | None = None) -> tuple[Floats, Floats]:
+        """Scores (k,) and information (k, k) of some faults (q,); None: of all.
+
+        Parameters
+        ----------
+        scored
+            Those of the members.
+        used : (q,)
+            The faults.
+        """
+        p = self.members
+        some: slice | Bools = slice(None) if used is None else used[p:]
+        y, F = scored.score, scored.information
+        of_others, side, inner = scored.of(self.beside[:, some], self.W[:, p:][:, some])
+        if used is not None:
+            own = np.flatnonzero(used[:p])
+            y, F, side = y[own], submatrix(F, own, own), side[own]
+        return np.append(y, of_others), np.block([[F, side], [side.T, inner]])
 
     @cached_property
     def others(self) -> tuple[Floats, Floats]:
@@ -421,9 +543,11 @@ def columns(modes: Modes, powers: Floats, power_std: Floats, std: float) -> Colu
         Prior standard deviation of faults of meters and of the busbar, squared pu.
     """
     H = modes.phases
+    beside = np.hstack([powers[modes.at], H])
     return Columns(
-        W=np.hstack([modes.U.T, modes.U.T @ powers[modes.at], modes.U.T @ H]),
+        W=np.hstack([modes.U.T, modes.U.T @ beside]),
         std=np.concatenate([np.full(modes.size, std), power_std, np.full(H.shape[1], std)]),
         members=modes.size,
         powers=power_std.size,
+        beside=beside,
     )

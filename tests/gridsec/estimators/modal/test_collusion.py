@@ -8,7 +8,7 @@ from math import inf
 
 import numpy as np
 import pytest
-from scipy.optimize import nnls
+from scipy.optimize import lsq_linear, nnls
 
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.modal import collusion
@@ -334,3 +334,35 @@ def test_a_sole_fault_of_the_busbar_is_left_to_the_prior() -> None:
     assert collusion.weighed(one, NONE, near(5)).found is one
     out = collusion.weighed(one, some(11), near(5)).found
     assert out.weight @ ~out.chosen[:, -1] >= DOUBT
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_bound_without_accused_meters_is_that_of_all_sets(seed: int, sign: float) -> None:
+    """Against bounded least squares of all meters and the power, and against the costs of sets."""
+    random = np.random.default_rng(seed)
+    given = street(0.3 * random.standard_normal(METERS), seed, power=0.4)
+    accused, power = np.append(some(1, 2, 7), False), np.append(NONE, True)
+    loose = collusion._Loose.of(given, accused | power)
+    assert loose is not None
+    found = loose.without(accused, sign)
+    A = given.F + np.diag(np.where(power, given.std**-2.0, 0.0))
+    half = np.linalg.cholesky(A)
+    target = np.linalg.solve(half, given.y)
+    least, most = np.full(METERS + 1, -inf), np.full(METERS + 1, inf)
+    (most if sign > 0.0 else least)[accused] = 0.0
+    exact = lsq_linear(half.T, target, (least, most), tol=1e-14)
+    assert found == pytest.approx(2.0 * exact.cost - target @ target, rel=1e-6)
+    for chosen in (random.random((200, METERS + 1)) < 0.4) & ~accused:
+        assert cost(given, chosen) - penalties(METERS)[chosen[:METERS].sum()] >= found
+    # The power itself is accused: sets without it.
+    alone = collusion._Loose.of(given, power)
+    assert alone is not None
+    rest = -given.y[:METERS] @ np.linalg.solve(given.F[:METERS, :METERS], given.y[:METERS])
+    assert alone.least <= alone.without(power, sign) <= rest + 1e-6 * abs(rest)
+
+
+def test_no_bound_is_given_where_readings_are_too_few() -> None:
+    given = street(np.zeros(METERS))
+    few = replace(given, F=np.ones_like(given.F))
+    assert collusion._Loose.of(few, np.append(NONE, False)) is None

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gridsec.arrays import Bools
+from gridsec.arrays import Bools, Floats
+from gridsec.estimators.modal.alike import Alike
 from gridsec.estimators.modal.costs import (
     SearchProblem,
     Tableau,
@@ -137,7 +138,58 @@ def test_costs_changes_and_exchanges_are_exact(seed: int) -> None:
     for each, change in zip(some, changes, strict=True):
         other = tableau.chosen ^ np.append(each, np.zeros(given.y.size - given.meters, dtype=np.bool_))
         assert tableau.cost + change == pytest.approx(cost(given, other), abs=1e-7)
-    assert np.isfinite(tableau.A).all()
-    again = Tableau(given).pivot(tableau.chosen)
-    assert np.allclose(again.A, tableau.A, atol=1e-8 * np.abs(tableau.A).max())
-    assert again.cost == pytest.approx(tableau.cost, abs=1e-8)
+    for each in (tableau, Tableau(given).pivot(tableau.chosen)):
+        assert each.cost == pytest.approx(cost(given, tableau.chosen), abs=1e-8)
+        assert_swept(each)
+
+
+def swept(given: SearchProblem, chosen: Bools) -> Floats:
+    """The whole tableau with the scores as its border, by the inverse of a set's information."""
+    q, J = given.y.size, np.flatnonzero(chosen)
+    A = np.zeros((q + 1, q + 1))
+    A[:q, :q], A[q, :q], A[:q, q] = given.F + np.diag(given.std**-2.0), given.y, given.y
+    inverse = np.linalg.inv(A[np.ix_(J, J)])
+    out = A - A[:, J] @ inverse @ A[J]
+    out[:, J] = A[:, J] @ inverse
+    out[J] = out[:, J].T
+    out[np.ix_(J, J)] = -inverse
+    return out
+
+
+def assert_swept(tableau: Tableau) -> None:
+    """All that a tableau keeps, and the entries that follow from it."""
+    expected, q = swept(tableau.problem, tableau.chosen), tableau.chosen.size
+    close, every = {"atol": 1e-8 * float(np.abs(expected).max())}, np.random.default_rng(0).permutation(q)
+    out = np.flatnonzero(tableau.chosen)
+    assert np.allclose(tableau.diagonal, expected.diagonal()[:q], **close)
+    assert np.allclose(tableau.borders[:, 0], expected[:, q], **close)
+    assert np.allclose(tableau.beside, expected[:, tableau.order], **close)
+    assert np.allclose(tableau.of(out), expected[out, :q], **close)
+    assert np.allclose(tableau.part(every), expected[np.ix_(every, every)], **close)
+
+
+@pytest.mark.parametrize("share", [0.0, ALIKE])
+def test_costs_after_a_removal_and_another_change_are_exact(share: float) -> None:
+    """Second changes by a tableau of either prior, against the costs of the sets."""
+    given = problem(3, p=9, others=3, liars=4)
+    tableau = (Alike(given, share) if share else Tableau(given)).pivot(np.arange(12) % 3 != 1)
+    tableau.barred[1] = True
+    out = np.flatnonzero(tableau.chosen)
+    found = tableau.seconds(out)
+    for i, j in np.ndindex(found.shape):
+        other = tableau.chosen.copy()
+        other[out[i]], other[j] = False, not other[j]
+        if j in {1, out[i]}:
+            assert np.isinf(found[i, j])
+        else:
+            assert tableau.whole + found[i, j] == pytest.approx(cost(given, other, share), abs=1e-7)
+
+
+def test_tableau_has_room_for_all_faults() -> None:
+    """Faults that are added one by one, beyond the room of the columns, and removed again."""
+    given, random = problem(4, p=40, others=6), np.random.default_rng(4)
+    tableau = Tableau(given)
+    for j in (*random.permutation(46), *random.permutation(46)[:30]):
+        tableau.toggle(int(j))
+    assert np.count_nonzero(tableau.chosen) == 16
+    assert_swept(tableau)

@@ -80,6 +80,8 @@ def test_likelihood_ratios_equal_those_of_dense_filters(make: object, ramp: bool
     y, F = now.of(of.W, of.W**2)
     each = ((y[:, [q]], F[:, [q]], np.square(of.std[[q]])) for q in range(of.std.size))
     found = np.array([detector.log_mean(*one)[row] for one in each])
+    at_members = of.of(signatures.scored(made, onsets, more, row))
+    assert all(np.allclose(one, other) for one, other in zip(at_members, together.of(of.W), strict=True))
     if made.sign.size <= static.FEW:
         matrix = together.of(of.W)
         assert np.allclose(matrix[0], y[row])

@@ -15,7 +15,7 @@ from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.costs import SearchProblem
 from gridsec.estimators.modal.doubts import Unknown
 from gridsec.estimators.modal.model import modes
-from gridsec.estimators.modal.signatures import Joint
+from gridsec.estimators.modal.signatures import Scored
 from gridsec.grid.network import Power
 from tests.gridsec.estimators.modal.streets import front_end
 from tests.gridsec.estimators.modal.test_core import MODEL
@@ -189,11 +189,11 @@ def test_the_search_integrates_lasting_errors_out() -> None:
     random = np.random.default_rng(6)
     kernel = core.assemble(MODEL, np.vstack([np.zeros(12), STEPS]), np.full(12, 0.1), gamma=1e6)
     root, U = random.standard_normal((12, 12)), 0.02 * random.standard_normal((12, 2))
-    joint = Joint(random.standard_normal(12), root @ root.T, np.zeros((2, 12, 12)), 1.0)
-    reduced, gain = core._problem(kernel, joint, U)
-    W = np.hstack([kernel.faults.W, kernel.modes.U.T @ U])
-    y, F = joint.of(W)
-    plain, none = core._problem(kernel, joint, None)
+    scored = Scored(random.standard_normal(12), root @ root.T)
+    reduced, gain = core._problem(kernel, scored, U)
+    columns = np.hstack([np.eye(12), kernel.faults.beside, U])
+    y, F = columns.T @ scored.score, columns.T @ scored.information @ columns
+    plain, none = core._problem(kernel, scored, None)
     assert none == 0.0
     whole = SearchProblem(
         y,
@@ -206,6 +206,11 @@ def test_the_search_integrates_lasting_errors_out() -> None:
     for chosen in random.random((5, plain.y.size)) < 0.2:
         both = np.append(chosen, [True, True])
         assert np.isclose(costs.cost(reduced, chosen) - 2.0 * gain, costs.cost(whole, both))
+        few, same = core._problem(kernel, scored, U, chosen)
+        assert same == gain
+        assert np.allclose(few.y, reduced.y[chosen])
+        assert np.allclose(few.F, reduced.F[np.ix_(chosen, chosen)])
+        assert few.meters == np.count_nonzero(chosen[:12])
 
 
 def test_a_lasting_error_does_not_decide_between_meters_over_time() -> None:
@@ -221,7 +226,7 @@ def test_a_lasting_error_does_not_decide_between_meters_over_time() -> None:
         m = source.tick() + lie * (k >= 40) + 0.06 * group * (k >= 40)
         state, _ = core.step(kernel, state, float(k), m, None, unknown)
         if k in (60, 339):
-            problem, _ = core._problem(kernel, state.suspected[0].joint(kernel.modes), unknown)
+            problem, _ = core._problem(kernel, state.suspected[0].scored, unknown)
             sets = (np.arange(problem.y.size) == 9, np.isin(np.arange(problem.y.size), (10, 11)))
             odds.append(costs.cost(problem, sets[0]) - costs.cost(problem, sets[1]))
     assert abs(odds[1] - odds[0]) < 10.0

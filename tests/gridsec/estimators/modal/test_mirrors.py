@@ -11,8 +11,8 @@ from benchmarks._residuals import Source, model_of, power_columns, tree
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.modal import core, mirrors
 from gridsec.estimators.modal.core import Core
-from gridsec.estimators.modal.costs import SearchProblem
-from gridsec.estimators.modal.search import Identification, identified
+from gridsec.estimators.modal.costs import SearchProblem, mean_likelihood
+from gridsec.estimators.modal.search import ALIKE, Identification, identified
 from tests.gridsec.estimators.modal.test_search import problem
 
 FEEDER = tree(12, np.random.default_rng(3))
@@ -40,33 +40,48 @@ def looked(of: Core, lie: Floats, unknown: Floats | None = None) -> Identificati
     return core.identify(of, state, evidence).found
 
 
-def test_likelihoods_of_one_amount_are_exact() -> None:
-    """Against the covariance of all amounts by a dense determinant."""
-    given = problem(3, p=8, others=2)
-    rest, alike = np.array([1, 8]), np.isin(np.arange(8), (2, 4, 5))
-    at = np.array([1, 8, 2, 4, 5])
-    V = np.diag(given.std[at] ** 2)
-    V[2:, 2:] = given.std[2] ** 2
-    F, y = given.F[np.ix_(at, at)], given.y[at]
-    want = np.linalg.slogdet(np.eye(5) + V @ F)[1] - y @ np.linalg.solve(np.eye(5) + V @ F, V @ y)
-    assert np.isclose(mirrors._likelihood(given, rest, alike), want)
-    assert mirrors._likelihood(given, np.zeros(0, dtype=np.intp), None) == 0.0
-
-
-@pytest.mark.parametrize("share", [0.0, 0.99])
-def test_likelihoods_of_amounts_alike_are_exact(share: float) -> None:
-    """Three meters with a share of their variance in common, a power, and two meters with one amount."""
-    given, at = problem(4, p=8, others=2), np.array([0, 3, 6, 9, 1, 2])
-    given = replace(given, std=np.linspace(0.5, 2.0, 10))
-    correlation = np.eye(6)
-    correlation[:3, :3] += share * (1.0 - np.eye(3))
-    correlation[4:, 4:] = 1.0
-    std = np.append(given.std[at[:4]], given.std[[0, 0]])
+def of_column(given: SearchProblem, rest: Bools, column: Bools, share: float) -> float:
+    """L of faults and of meters with one amount, by the covariance of all amounts and a dense determinant."""
+    p, at = given.meters, np.concatenate([np.flatnonzero(rest), np.flatnonzero(column)])
+    n, k = np.count_nonzero(rest), np.count_nonzero(rest[:p])
+    correlation = np.eye(at.size)
+    if k > 1:
+        correlation[:k, :k] += share * (1.0 - np.eye(k))
+    correlation[n:, n:] = 1.0
+    std = np.append(given.std[at[:n]], np.full(at.size - n, given.std[0]))
     V = std[:, None] * correlation * std
     F, y = given.F[np.ix_(at, at)], given.y[at]
-    want = np.linalg.slogdet(np.eye(6) + V @ F)[1] - y @ np.linalg.solve(np.eye(6) + V @ F, V @ y)
-    column = np.isin(np.arange(8), at[4:])
-    assert np.isclose(mirrors._likelihood(given, at[:4], column, share), want)
+    A = np.eye(at.size) + V @ F
+    charge = float(given.charge.max()) if share and k > 1 else 0.0
+    return float(np.linalg.slogdet(A)[1] - y @ np.linalg.solve(A, V @ y)) + charge
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_likelihoods_of_parts_of_a_set_with_a_column_are_exact(seed: int) -> None:
+    """Both priors, parts with few meters and none, columns inside and outside of the set, and no column."""
+    random = np.random.default_rng(seed)
+    given = replace(problem(4 + seed, p=9, others=3), std=random.uniform(0.5, 2.0, 12))
+    chosen = np.isin(np.arange(12), (0, 2, 3, 5, 6, 9, 11))
+    likelihood = mirrors._Likelihood(given, chosen)
+    rest = chosen & (random.random((20, 12)) < np.linspace(0.0, 1.0, 20)[:, None])
+    columns = (random.random((20, 9)) < 0.4) & ~rest[:, :9]
+    columns[7] = False
+    own = [of_column(given, chosen, columns[7], share) for share in (0.0, ALIKE)]
+    counted = [k for k in range(2) if own[k] <= min(own) + mirrors.APART]
+    assert likelihood.own == pytest.approx(float(mean_likelihood(np.array(own)[counted])), abs=1e-7)
+    for one, column, found in zip(rest, columns, likelihood(rest, columns), strict=True):
+        each = np.array([of_column(given, one, column, share) for share in (0.0, ALIKE)])
+        assert found == pytest.approx(float(mean_likelihood(each[counted])), abs=1e-7)
+    assert likelihood(rest[:0], columns[:0]).shape == (0,)
+
+
+def test_a_prior_that_is_far_worse_for_a_set_does_not_count_for_its_images() -> None:
+    """Two meters that are off by the reverse amounts: amounts alike do not count."""
+    F, truth = 1e4 * np.eye(5), np.array([1.0, -1.0, 0.0, 0.0, 0.0])
+    given = SearchProblem(F @ truth, F, np.ones(5), 4, np.zeros(5), np.full(5, np.inf))
+    likelihood, chosen = mirrors._Likelihood(given, truth != 0.0), truth != 0.0
+    assert likelihood.shares == (0.0,)
+    assert likelihood.own == pytest.approx(of_column(given, chosen, np.zeros(4, np.bool_), 0.0))
 
 
 def test_a_mirror_image_costs_as_much_as_its_set_where_readings_agree() -> None:
