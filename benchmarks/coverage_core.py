@@ -110,7 +110,8 @@ class Watch:
         age = int(self.state.detector.onsets.age[found.row])
         self.suspicion, self.streak = found, streak
         self.due = tick + (1 if (streak[named] == 1).any() or self.phases == 1 else max(1, age // LOOKS))
-        sure = confirmed(found.found, named, streak, bool(self.state.masked.meters.any()))
+        since = () if self.state.masked.meters.any() else self.state.history.readings[-age:]
+        sure = confirmed(found.found, named, streak, since)
         if sure.any():
             final = replace(found, found=replace(found.found, named=sure))
             self.state, _ = core.mask(self.kernel, self.state, final)

@@ -61,7 +61,7 @@ class FrontOptions:
     largest_offset_s
         Largest clock offset of a usable reading, s; a quarter of a tick where that is longer.
     widest, v2_limits, settled
-        As in `gridsec.estimators.plant.Options`. A meter with a reading outside `v2_limits` is false, too.
+        As in `gridsec.estimators.plant.Options`; `v2_limits` bound readings (`measurements.impossible`).
 
     Raises
     ------

@@ -57,16 +57,20 @@ class Measurements:
 
 
 def impossible(design: FrontDesign, frame: Frame, named: Bools) -> tuple[Bools, Frame]:
-    """Meters with a reading outside `v2_limits`, (p,), which no load causes, and the frame to use.
+    """Meters that read more than a voltage can be, (p,), and the frame to use.
 
-    It lacks these readings where their meters and those `named` (p,) are more than the promised number: then
-    the feeder has failed, and no meter is false.
+    Readings outside `v2_limits` count as missing where their meters and those `named` (p,) are more than the
+    number that the other readings tell apart, as in an outage. Elsewhere a reading above the limits is false:
+    no load and no outage causes it. One below them may be an outage of one customer, and is judged as others.
     """
     low, high = design.options.v2_limits
-    out = np.asarray(frame.seen & np.isfinite(frame.y) & ((frame.y < low) | (frame.y > high)))
-    if any_of(out) and np.count_nonzero(out | named) > design.max_attacked:
-        frame = replace(frame, seen=frame.seen & ~out)
-    return out, frame
+    above = frame.seen & np.isfinite(frame.y) & (frame.y > high)
+    out = above | (frame.seen & np.isfinite(frame.y) & (frame.y < low))
+    if not any_of(out):
+        return above, frame
+    if np.count_nonzero(out | named) > design.most_among(int(np.count_nonzero(frame.seen & ~out))):
+        return np.zeros_like(out), replace(frame, seen=frame.seen & ~out)
+    return above, frame
 
 
 def plausible(design: FrontDesign, frame: Frame) -> Frame:

@@ -15,11 +15,11 @@ A step, by module:
 
 The residual of a meter is its squared reading less the model; fixed errors are states of the filter.
 Registers err in proportion to v2: with b at 1 pu, ``b (v2 - 1)`` by the mean of b before the tick is no part
-of the residual. A meter is named when a search names it as the only fault, when `CONFIRM` searches in turn
-have it in their likeliest explanations, when it repeats its readings beyond chance, or when it reads what is
-no voltage. Others of its explanation may delay it (`naming`). Named meters are masked from the onset on, and
-released by their readings (`masking`). The busbar's meter is named by searches in turn. Its phase then counts
-as not metered, until both agree.
+of the residual. A meter is named when one search names it as the only fault with two readings, when `CONFIRM`
+searches in turn have it in their likeliest explanations, when it repeats its readings beyond chance, or when
+it reads more than a voltage can be. Others of its explanation may delay it (`naming`). Named meters are
+masked from the onset on, and released by their readings (`masking`). The busbar's meter is named by searches
+in turn. Its phase then counts as not metered, until both agree.
 """
 
 from __future__ import annotations
@@ -261,7 +261,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     repeated = front_state.repeated(front, given, frame)
     if repeated is not None:
         return state, *repeated
-    wild, frame = impossible(front, frame, given.trust.named)
+    false, frame = impossible(front, frame, given.trust.named)
     history, frame = without_shifted_busbar(
         front, given.busbar_history, plausible(front, frame), given.trust.trusted, given.v0_squared
     )
@@ -275,8 +275,10 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     )
     h, free = frame.t - given.t, front.inverters_of(~given.trust.trusted)
     injections = drive.followed(front, state.injections, given, predicted, free, h)
-    jumps = (trusted & ~given.trust.trusted) | (wild & ~measured.available)
-    held = np.where(jumps, HELD, np.maximum(state.held - measured.available, 0))
+    held = state.held
+    if given.trust.trusted is not trusted or any_of(held):
+        jumps = trusted & ~given.trust.trusted
+        held = np.where(jumps, HELD, np.maximum(held - measured.available, 0))
     v2 = predicted.v2_bus[front.prior.meters]
     last = None
     # A power that comes back is no step of the voltage.
@@ -306,7 +308,7 @@ def step(design: ModalDesign, state: ModalState, frame: Frame) -> tuple[ModalSta
     kernel = _begun_anew(design, state, frame.t) if open_ is None and whole else state.core
     kernel, evidence = core.step(
         design.core,
-        _without(kernel, (repeat_lags(kinds) > 0) | (wild & measured.available)),
+        _without(kernel, (repeat_lags(kinds) > 0) | (false & measured.available)),
         frame.t,
         m,
         None if whole else seen,
@@ -390,7 +392,8 @@ def _named(
     first = any((each == 1).any() for each in (streak[named], phases, inverters))
     wait = 1 if first else max(1, age // LOOKS)
     after = replace(state, streak=streak, phases=phases, inverters=inverters, due=tick + wait)
-    sure = final(suspicion.found, named, streak, any_of(masked), kernel.near.laterals)
+    since = () if any_of(masked) else state.core.history.readings[-age:]
+    sure = final(suspicion.found, named, streak, since, kernel.near.laterals)
     if suspicion.fits and not any_of(sure):
         # Masked meters alone may have been manipulated before they were masked.
         sure = alone(suspicion.found, masked)

@@ -1,10 +1,11 @@
 """Final names: meters that searches in turn accuse, masked together or where nothing depends on it.
 
-    final(found, named, streak, masked, laterals) -> (p,)     meters to mask
+    final(found, named, streak, since, laterals) -> (p,)      meters to mask
     unseen(design, effect, most, lead, off) -> bool           steps by other clocks may explain them
 
 A search names the meters without which nothing explains the readings. The first explanation of several faults
-may be a part of them: names need searches in turn, `confirmed`. A sole fault is named by its first reading.
+may be a part of them: names need searches in turn, `confirmed`. A sole fault is named by one search, and two
+readings: a step of the busbar is in one reading a tick early or late by clocks that differ by half a tick.
 
 **Parts of an explanation.** Masked meters have any amounts. With N the meters to mask, of the scores y and
 the information F of the others remain
@@ -20,6 +21,7 @@ N is masked in any case.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,12 +31,13 @@ from gridsec.estimators.front.design import FrontDesign
 from gridsec.estimators.front.measurements import SYNCHRONOUS_S
 from gridsec.estimators.modal.costs import SearchProblem, informed
 from gridsec.estimators.modal.laterals import excess
+from gridsec.estimators.modal.replay import Reading
 from gridsec.estimators.modal.search import SOME, Identification, mixed
 
 TAP = 0.05
 """Largest step of a tap changer, squared pu: 2.5 % of the voltage."""
 CONFIRM = 2
-"""Searches in turn that accuse one of several faults before it is named: the first may have a part."""
+"""Searches in turn that accuse one of several faults before it is named, and readings of a sole one."""
 APART = 2 * CONFIRM
 """Searches in turn after which a meter is named beside others that are not confirmed yet."""
 WHOLE = 8 * CONFIRM
@@ -47,23 +50,25 @@ FLAT = 1e-6
 """Prior information of the amounts of masked meters, in that of the prior, 1: rounding."""
 
 
-def final(found: Identification, named: Bools, streak: Ints, masked: bool, laterals: Bools) -> Bools:
+def final(
+    found: Identification, named: Bools, streak: Ints, since: Sequence[Reading], laterals: Bools
+) -> Bools:
     """Meters to mask now, (p,).
 
     Parameters
     ----------
-    found, named, streak, masked
+    found, named, streak, since
         As in `confirmed`.
     laterals : (G, p)
         Members of the laterals that may be manipulated as a whole.
     """
-    sure = confirmed(found, named, streak, masked)
+    sure = confirmed(found, named, streak, since)
     if not any_of(sure) or streak[sure].max() >= WHOLE or separable(found, sure, laterals):
         return sure
     return np.zeros_like(sure)
 
 
-def confirmed(found: Identification, named: Bools, streak: Ints, masked: bool) -> Bools:
+def confirmed(found: Identification, named: Bools, streak: Ints, since: Sequence[Reading]) -> Bools:
     """Meters that a search names finally, (p,).
 
     Parameters
@@ -74,11 +79,13 @@ def confirmed(found: Identification, named: Bools, streak: Ints, masked: bool) -
         Meters that it names newly.
     streak : (p,)
         Searches in turn with each in the likeliest explanation.
-    masked
-        Meters are masked: others may collude with them.
+    since
+        Ticks since the suspected onset; none where meters are masked, and may collude with others.
     """
-    if not masked and np.count_nonzero(found.chosen[0]) == 1:
-        return named
+    if any_of(named) and np.count_nonzero(found.chosen[0]) == 1:
+        readings = sum(seen is None or all_of(seen[named]) for _, _, seen, *_ in since)
+        if readings >= CONFIRM:
+            return named
     # Without a part of the meters, other faults may explain the rest: a few more searches may name all.
     least = CONFIRM if all_of(streak[named] >= CONFIRM) else APART
     return np.asarray(named & (streak >= least))

@@ -415,14 +415,14 @@ class Scored:
         precision : (t, t)
             Inverse of the prior covariance of their amounts.
         """
-        half, _ = lapack.dpotrf(self.information + precision, lower=True, overwrite_a=True)
+        half = np.linalg.cholesky(self.information + precision)
         white, _ = lapack.dtrtrs(half, self.score, lower=True)
         return 2.0 * float(np.log(half.diagonal()).sum()) - float(white @ white)
 
     def beside(self, unknown: Floats) -> tuple[Scored, float]:
         """The same with unknown errors integrated out, and the gain of evidence by these.
 
-        With scores y_n and information F_n of the directions n, whose amounts are N(0, 1),
+        With scores y_n and information F_n of the directions n with amounts N(0, 1),
 
             M = F_nn + 1,  y - F_n M^-1 y_n,  F - F_n M^-1 F_n',  gain = (y_n' M^-1 y_n - log det M) / 2
 
@@ -432,7 +432,7 @@ class Scored:
             Directions of the residuals, times the standard deviations of their amounts.
         """
         side = self.information @ unknown
-        half, _ = lapack.dpotrf(unknown.T @ side + np.eye(unknown.shape[1]), lower=True, clean=True)
+        half = np.linalg.cholesky(unknown.T @ side + np.eye(unknown.shape[1]))
         rows = np.column_stack([side.T, self.score @ unknown])
         white, _ = lapack.dtrtrs(half, rows, lower=True)
         F, y = white[:, :-1], white[:, -1]

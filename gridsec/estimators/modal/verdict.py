@@ -405,10 +405,10 @@ def unreported(  # noqa: PLR0917  # the core, and one inverter
 ) -> tuple[float, float]:
     """Evidence of the voltages of one tick on the inverter of meter j, `a` beyond its curve, pu, as `Share`.
 
-    The filter does not learn the injection of a named inverter. With the covariance V of the residuals u less
-    their means, without that injection, and its column c, twice the logarithm of the ratio of likelihoods is
-    ``2 a c' V^-1 u - a^2 c' V^-1 c``. It learns that of another: while an onset is suspected, its voltages
-    say nothing.
+    The filter does not learn the injection of a named inverter. Let u be the residuals less their means after
+    the tick, V about their covariance without that injection, and c its column. Twice the logarithm of the
+    ratio of likelihoods is ``2 a c' V^-1 u - a^2 c' V^-1 c``. The filter learns the injection of another
+    inverter: while an onset is suspected, its voltages say nothing.
 
     Parameters
     ----------

@@ -69,6 +69,29 @@ def test_boilers_that_are_switched_together_name_no_meter(seed: int, count: int,
     assert not np.any([each.suspects for each in scene.watch(200, boilers)])
 
 
+@pytest.mark.parametrize(("shift", "step"), [(-1, 0.008), (-1, 0.02), (1, 0.007), (1, 0.02)])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_meter_with_a_clock_within_half_a_tick_is_not_named(shift: int, step: float, seed: int) -> None:
+    """One meter shows a step of the busbar a tick before all others, or after them; no offset is measured."""
+    random = np.random.default_rng(seed)
+    none = np.zeros(0, dtype=np.intp)
+    street = Street(make_plant(random, customers=12, drop=0.03, inverters=none), random)
+    made, meter = prepare(street.plant), int(random.integers(12))
+    state, last = monitor.init(made, street.t), np.zeros(12)
+    for k in range(110):
+        street.v0 += step * (k == ONSET)
+        street.advance(1.0)
+        frame = street.frame()
+        y = frame.y.copy()
+        if shift < 0 and k == ONSET - 1:
+            y[meter] = (np.sqrt(y[meter]) + step) ** 2
+        if shift > 0 and k == ONSET:
+            y[meter] = last[meter]
+        state, _, verdict = monitor.step(made, state, replace(frame, y=y))
+        last = frame.y
+        assert not verdict.suspects.any()
+
+
 @pytest.mark.parametrize("customers", [(6,), (6, 8)])
 def test_metered_reactive_powers_of_another_moment_name_no_meter(customers: tuple[int, ...]) -> None:
     """12 kW with a power factor that changes each minute, at customers with clocks that are ahead."""

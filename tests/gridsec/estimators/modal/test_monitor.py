@@ -10,6 +10,7 @@ import pytest
 from gridsec.arrays import Bools
 from gridsec.estimators.modal.monitor import design, init, own_errors, step
 from gridsec.estimators.modal.naming import APART, CONFIRM, confirmed
+from gridsec.estimators.modal.replay import Reading
 from gridsec.estimators.modal.search import Identification
 from gridsec.estimators.modal.verdict import combined
 from gridsec.interface import Decision, Explanation
@@ -29,39 +30,52 @@ def found(*faults: int) -> Identification:
     return Identification(every, np.zeros(1, np.intp), np.ones(1), every[0, :P], ())
 
 
+def ticks(*seen: Bools | None) -> list[Reading]:
+    return [(float(k), np.zeros(P), one, None) for k, one in enumerate(seen)]
+
+
 NONE = np.zeros(P, dtype=np.intp)
 
 
-def test_a_sole_fault_is_named_by_one_search() -> None:
-    assert confirmed(found(2), mask(2), NONE + mask(2), False).tolist() == mask(2).tolist()
+def test_a_sole_fault_with_two_readings_is_named_by_one_search() -> None:
+    assert confirmed(found(2), mask(2), NONE + mask(2), ticks(None, None)).tolist() == mask(2).tolist()
+
+
+@pytest.mark.parametrize(
+    "since",
+    [ticks(None), ticks(mask(0, 1), mask(0, 1), None), ticks(mask(0), mask(2))],
+    ids=["one tick", "after a gap", "silent"],
+)
+def test_one_reading_of_the_meter_is_not_enough(since: list[Reading]) -> None:
+    assert not confirmed(found(2), mask(2), NONE + mask(2), since).any()
 
 
 @pytest.mark.parametrize("faults", [(1, 2), (2, 5), (2, 6)], ids=["meter", "power", "busbar"])
 def test_a_part_of_several_faults_needs_searches_in_turn(faults: tuple[int, ...]) -> None:
-    several = found(*faults)
+    several, since = found(*faults), ticks(None, None, None)
     named = replace(several, named=mask(2)).named
-    assert not confirmed(several, named, NONE + named, False).any()
-    assert confirmed(several, named, CONFIRM * named, False).tolist() == named.tolist()
+    assert not confirmed(several, named, NONE + named, since).any()
+    assert confirmed(several, named, CONFIRM * named, since).tolist() == named.tolist()
 
 
 def test_meters_that_are_named_by_turns_of_different_length_are_apart() -> None:
     """An explanation is named whole; after `APART` searches in turn a meter is named by itself."""
-    streak = CONFIRM * mask(1) + mask(3)
-    assert confirmed(found(1, 3), mask(1, 3), streak + mask(3), False).tolist() == mask(1, 3).tolist()
-    assert not confirmed(found(1, 3), mask(1, 3), streak, False).any()
+    streak, since = CONFIRM * mask(1) + mask(3), ticks(None, None)
+    assert confirmed(found(1, 3), mask(1, 3), streak + mask(3), since).tolist() == mask(1, 3).tolist()
+    assert not confirmed(found(1, 3), mask(1, 3), streak, since).any()
     later = streak + (APART - CONFIRM) * mask(1)
-    assert confirmed(found(1, 3), mask(1, 3), later, False).tolist() == mask(1).tolist()
+    assert confirmed(found(1, 3), mask(1, 3), later, since).tolist() == mask(1).tolist()
 
 
 def test_a_meter_that_is_accused_but_not_named_is_not_final() -> None:
     """Searches in turn count for the likeliest explanation; the last one has to name the meter."""
     streak = CONFIRM * mask(1, 3)
-    assert confirmed(found(1, 3), mask(3), streak, False).tolist() == mask(3).tolist()
+    assert confirmed(found(1, 3), mask(3), streak, ticks(None, None)).tolist() == mask(3).tolist()
 
 
 def test_masked_meters_leave_no_fault_alone() -> None:
-    """A sole fault beside masked meters needs searches in turn."""
-    assert not confirmed(found(2), mask(2), NONE + mask(2), True).any()
+    """Without the ticks since the onset, a sole fault needs searches in turn."""
+    assert not confirmed(found(2), mask(2), NONE + mask(2), []).any()
 
 
 def test_errors_of_registers_follow_the_voltage() -> None:

@@ -186,6 +186,7 @@ class TestPhasesThatDoNotTouch:
         expected, std = np.array([each.std for each, _ in alone]), estimate.std.reshape(3, CUSTOMERS)
         np.testing.assert_allclose(std[1], expected[1], rtol=0, atol=2e-9)
         assert (std <= expected + 2e-9).all()
+        assert (std >= 0.8 * expected).all()
 
 
 def spread_evenly(name: str, kw: float) -> tuple[Site, Site]:
@@ -337,10 +338,9 @@ class TestTheEuropeanFeeder:
             answers.append(verdict.decision)
             false |= np.isfinite(heard.y) & (heard.y != frame.y)
             assert not verdict.suspects[~false].any()
-        # Nobody can call a feeder clean of which every fifth voltage is no voltage.
+        # Other meters are false at every tick, and more than promised in all: no verdict is CLEAN.
         assert answers[19] is Decision.CLEAN
         assert Decision.CLEAN not in answers[20:]
-        assert Decision.ATTACKED in answers[20:]
         # The same frame again is not used.
         _, _, verdict = watcher.step(state, frame)
         assert verdict.decision is Decision.UNDECIDED
