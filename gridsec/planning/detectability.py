@@ -290,7 +290,7 @@ def _tests(  # noqa: PLR0917  # the core, and one onset
         bias=np.concatenate([np.zeros(noise.size), rows[4]])[counted],
         form=half,
         # `moves` is what corrects the estimate.
-        weights=-estimate.moves(made, core.estimator, now.filter, joint, made.U.T, still),
+        weights=-estimate.moves(made, core.estimator, now.filter, joint, np.eye(p), still),
     )
 
 

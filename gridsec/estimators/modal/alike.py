@@ -37,6 +37,7 @@ References
 
 from __future__ import annotations
 
+from math import inf
 from typing import Self
 
 import numpy as np
@@ -166,6 +167,42 @@ class Alike(Tableau):
         share = bounded_minimum(A * np.outer(x, x), x * left, np.full(new.size, HALF))
         out[new[share > HALF]] = True
         return out
+
+
+def opposed(problem: SearchProblem, share: float, against: Bools, sign: float) -> float:
+    """Lower bound of the costs of sets of meters with amounts alike, by the amounts that oppose these.
+
+    Amounts have the variance v around the common one. A set costs at least its charge and the minimum of
+
+        f' F f - 2 y' f + sum f_j^2 / v_j
+
+    with the sum over amounts of the sign opposite to the common one. The minimum is at least ``-y' f`` for
+    ``f = (F + D)^-1 y``, with ``D_jj = 1 / v_j`` for any meters where f has that sign, and 0 for others.
+    Determinants and penalties are at least 0.
+
+    Parameters
+    ----------
+    problem, share
+        The problem, and the share of the meters' variance in common, below 1.
+    against : (p,)
+        Meters of D. Those where f has the sign of the common amount are left out.
+    sign
+        Sign of the common amount.
+    """
+    at = np.flatnonzero(informed(problem))
+    y, some = sign * problem.y[at], against[at]
+    information, own = submatrix(problem.F, at, at), 1.0 / (problem.std[at] ** 2 * (1.0 - share))
+    for _ in range(TRIES):
+        A = information.copy()
+        A[np.diag_indices(at.size)] += np.where(some, own, 0.0)
+        _, f, failed = lapack.dposv(A, y, lower=True, overwrite_a=True)
+        if failed:
+            break
+        wrong = some & (f > 0.0)
+        if not wrong.any():
+            return float(problem.charge.max(initial=0.0) - y @ f)
+        some = some & ~wrong
+    return -inf
 
 
 def bounded_minimum(A: Floats, v: Floats, start: Floats, most: float = 1.0) -> Floats:

@@ -334,7 +334,7 @@ def step(  # noqa: PLR0917  # the state, and one tick
         if pinned and not suspected:
             suspected = replay.carried(made, state.detector.onsets, state.static, pinned)
         suspected = tuple(replay.follow(made, each, update.exact, update.gap) for each in suspected)
-    others = tuple([rivals.follow(each, t, m, seen, unknown, jump) for each in state.rivals])
+    others = tuple(rivals.followed(state.rivals, t, m, seen, unknown, jump))
     if evidence.log_m >= core.limit and (not pinned or _elsewhere(state, evidence, test, others)):
         test = detector.pin(test, evidence.rows)
         last = replay.record(state.history, (after, known, test, ()), m, seen, unknown, jump)
@@ -781,9 +781,23 @@ def _level(core: Core, state: CoreState, row: int) -> float:
     return next(exact, float(detector.followed(core.modes, state.detector).onsets.level[row]))
 
 
-def _joint_under(core: Core, state: CoreState, row: int, model: int) -> Joint:
-    """Joint scores of one onset under a model by its number: 0, or that of a rival with its own onset."""
-    return state.rivals[model].joint() if model else _joint(core, _parts(state), row)
+def _moves(core: Core, state: CoreState, row: int, model: int, used: Bools) -> Floats:
+    """Change of the estimate per amount of each used fault, (n, q), under a model by its number.
+
+    The onset is a row of the model, 0, or that of a rival.
+    """
+    p, rival, out = core.modes.size, state.rivals[model] if model else None, np.zeros_like(core.effect)
+    if not any_of(used):
+        return out
+    since: Suspected | Joint | None
+    if rival is None:
+        filtered, since = state.filter, next((each for each in state.suspected if each.row == row), None)
+        since = since or _joint(core, _parts(state), row)
+    else:
+        filtered, since = rival.filter, rival.suspected or rival.joint()
+    x = np.hstack([np.eye(p)[:, used[:p]], core.faults.beside[:, used[p:]]])
+    out[:, used] = estimates.moves(core.modes, core.estimator, filtered, since, x, core.effect[:, used])
+    return out
 
 
 def _searched(
@@ -853,17 +867,13 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     plain = estimates.honest(made, by, state.filter, state.static, loads=state.loads)
     if suspicion is None:
         return plain
-    found, T = suspicion.found, list[Floats]()
     others = (
         estimates.honest(each.modes, by, each.filter, each.static, loads=each.loads)
         for each in state.rivals[1:]
     )
     before = [plain, *others]
-    for model, filtered in enumerate((state.filter, *(each.filter for each in state.rivals[1:]))):
-        used, moved = found.chosen[found.model == model].any(axis=0), np.zeros_like(core.effect)
-        if used.any():
-            joint = _joint_under(core, state, suspicion.row, model)
-            W, effect = core.faults.W[:, used], core.effect[:, used]
-            moved[:, used] = estimates.moves(made, by, filtered, joint, W, effect)
-        T.append(moved)
+    found, row = suspicion.found, suspicion.row
+    counted = found.weight >= estimates.COUNTED
+    used = [found.chosen[counted & (found.model == model)].any(axis=0) for model in range(len(before))]
+    T = [_moves(core, state, row, model, each) for model, each in enumerate(used)]
     return estimates.corrected(before, T, found)

@@ -348,7 +348,8 @@ class Tableau:
         self.order = np.zeros(0, dtype=np.intp)
         self.chosen = np.zeros(q, dtype=np.bool_)
         self.barred = np.zeros(q, dtype=np.bool_)
-        self.cost = 0.0
+        # Number of chosen meters.
+        self.cost, self.count = 0.0, 0
         self.size = 2.0 * np.log(problem.std)
 
     def pivot(self, chosen: Bools) -> Self:
@@ -382,6 +383,7 @@ class Tableau:
         self.columns[:, r : r + J.size], borders[J] = beside, beside[q:].T
         self.diagonal[J] = -inverse.diagonal()
         self.order, self.chosen = J, chosen.copy()
+        self.count = int(np.count_nonzero(chosen[: self.problem.meters]))
         self.cost += float(self.penalty[self.count])
         return self
 
@@ -391,7 +393,8 @@ class Tableau:
         out.problem, out.penalty, out.size = self.problem, self.penalty, self.size
         out.rows, out.prior, out.order = self.rows, self.prior, self.order
         out.columns, out.diagonal = self.columns.copy(order="F"), self.diagonal.copy()
-        out.chosen, out.barred, out.cost = self.chosen.copy(), self.barred.copy(), self.cost
+        out.chosen, out.barred = self.chosen.copy(), self.barred.copy()
+        out.cost, out.count = self.cost, self.count
         return out
 
     @property
@@ -427,11 +430,6 @@ class Tableau:
     def whole(self) -> float:
         """Cost of the set, with all that the amounts have in common."""
         return self.cost
-
-    @property
-    def count(self) -> int:
-        """Number of chosen meters."""
-        return int(np.count_nonzero(self.chosen[: self.problem.meters]))
 
     @property
     def amount(self) -> Floats:
@@ -574,6 +572,8 @@ class Tableau:
             self.columns[:, r + n] = pivot
             self.order = np.append(self.order, j)
         self.chosen[j] = not inside
+        if j < self.problem.meters:
+            self.count += -1 if inside else 1
         self.cost += self.penalty[self.count] - self.penalty[k]
 
     def _column(self, j: int) -> Floats:

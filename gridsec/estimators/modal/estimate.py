@@ -35,6 +35,7 @@ from gridsec.estimators.front.output import BoundedEstimate, BoundInputs
 from gridsec.estimators.modal.costs import explained
 from gridsec.estimators.modal.filter import FilterState, Full
 from gridsec.estimators.modal.model import Modes
+from gridsec.estimators.modal.replay import Suspected
 from gridsec.estimators.modal.search import DOUBT, Identification
 from gridsec.estimators.modal.signatures import Joint
 from gridsec.estimators.modal.static import Static
@@ -181,8 +182,8 @@ def honest(
 
 
 def _mean(made: Estimator, w: Floats, b: Floats, e: Floats) -> Floats:
-    """Regression of all places on w, b and e, (n,)."""
-    parts = np.concatenate([made.by_w * w, made.right @ np.concatenate([b, e])])
+    """Regression of all places on w, b and e, (n,); or on columns of these."""
+    parts = np.concatenate([(made.by_w * w.T).T, made.right @ np.concatenate([b, e])])
     return np.asarray(made.of_parts @ parts)
 
 
@@ -210,7 +211,7 @@ def _variance(modes: Modes, made: Estimator, cov: Floats, static: Static, loads:
 
 def _full_variance(modes: Modes, made: Estimator, full: Full, loads: float) -> Floats:
     """Variance by the full covariance, (n,): the flicker is seen by the members with a reading only."""
-    model, by_e = modes.model, _flicker(modes, full)
+    model, by_e = modes.model, np.matmul(*_flicker(modes, full))
     read = ((by_e @ model.phases(modes.at)) * model.busbar_of).sum(axis=1)
     unread = (made.of_e**2).sum(axis=1) - model.flicker * read
     by = np.hstack([made.of_w @ modes.U.T - by_e, made.of_b @ modes.U.T - by_e])
@@ -220,35 +221,39 @@ def _full_variance(modes: Modes, made: Estimator, full: Full, loads: float) -> F
 
 
 def moves(  # noqa: PLR0917  # the state, and the faults
-    modes: Modes, made: Estimator, state: FilterState, joint: Joint, W: Floats, effect: Floats
+    modes: Modes, made: Estimator, state: FilterState, since: Joint | Suspected, x: Floats, effect: Floats
 ) -> Floats:
-    """Change T of the honest estimate per amount of each fault at one onset, (n, q).
+    """Change of the honest estimate by some faults since one onset, (n, k).
 
     Parameters
     ----------
     modes, made, state
         The modes, the estimator of them, and the filter after the last tick.
-    joint
-        Joint scores of the onset.
-    W : (t, q)
-        Columns of the faults in the modes.
-    effect : (n, q)
+    since
+        Scores of the onset.
+    x : (t, k)
+        The faults at the members.
+    effect : (n, k)
         Change of the model at each place by the faults: zero for meters.
     """
-    w, b = joint.shift @ W
-    felt = joint.level * W - w - b
-    of_e = made.of_e @ felt if state.full is None else _flicker(modes, state.full) @ (modes.back @ felt)
-    return np.asarray(effect - made.of_w @ w - made.of_b @ b - of_e)
+    w, b = since.moved(modes, x)
+    felt = since.level * (modes.U.T @ x) - w - b
+    if state.full is None:
+        return np.asarray(effect - _mean(made, w, b, felt))
+    places, by_e = _flicker(modes, state.full)
+    return np.asarray(effect - _mean(made, w, b, np.zeros_like(felt)) - places @ ((by_e @ modes.back) @ felt))
 
 
-def _flicker(modes: Modes, full: Full) -> Floats:
-    """Regression of the flicker at all places on the white errors of the members with a reading, (n, t)."""
+def _flicker(modes: Modes, full: Full) -> tuple[Floats, Floats]:
+    """Factors of the regression of the flicker at all places on the white errors of members, (n, b), (b, t).
+
+    Of members with a reading.
+    """
     model, n = modes.model, indices(full.seen)
-    by_e = np.zeros((len(model.busbar_of), modes.size))
+    by_e = np.zeros((modes.size, model.busbar_of.shape[1]))
     if n.size:
-        own = np.linalg.solve(submatrix(modes.noise, n, n), model.phases(modes.at[n]))
-        by_e[:, n] = model.flicker * (model.busbar_of @ own.T)
-    return by_e
+        by_e[n] = np.linalg.solve(submatrix(modes.noise, n, n), model.phases(modes.at[n]))
+    return model.flicker * model.busbar_of, by_e.T
 
 
 def corrected(before: Sequence[Estimated], T: Sequence[Floats], found: Identification) -> Estimated:
@@ -259,7 +264,7 @@ def corrected(before: Sequence[Estimated], T: Sequence[Floats], found: Identific
     before
         The honest estimate under each model of the loads.
     T : (n, q) each
-        From `moves`, of all faults of the problem, under each model; any value for faults in no explanation.
+        From `moves`, of all faults of the problem, under each model; any value for faults of none of weight.
     found
         The explanations.
     """

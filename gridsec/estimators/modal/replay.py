@@ -71,6 +71,10 @@ class Suspected:
         shift = np.stack([U.T @ self.shift[:t] @ back, U.T @ self.shift[t:] @ back])
         return Joint(self.score @ back, back.T @ self.information @ back, shift, self.level)
 
+    def moved(self, modes: Modes, x: Floats) -> Floats:
+        """As `Joint.moved`, in a third of the products."""
+        return np.asarray(modes.U.T @ (self.shift @ x).reshape(2, modes.size, -1))
+
 
 def beside(unknown: Floats | None, columns: Floats) -> Floats:
     """Unknown directions of a tick with more of them, (t, k)."""

@@ -30,9 +30,11 @@ Ghahramani and Hinton, Variational learning for switching state-space models, Ne
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from math import log, sqrt
+from typing import Any
 
 import numpy as np
 from scipy.linalg import lapack
@@ -173,7 +175,7 @@ def rivals(modes: Modes) -> tuple[Modes, ...]:
     modes
         The modes of the model.
     """
-    return tuple(replace(modes, varying=scale * modes.varying) for scale in UNREST)
+    return tuple(modes if scale == 1.0 else replace(modes, varying=scale * modes.varying) for scale in UNREST)
 
 
 def jumps(modes: Modes) -> tuple[float, ...]:
@@ -229,8 +231,8 @@ def replayed(
     if older and (state.full is None or exactly is not None):
         begin, one = -1, signatures.single(had, row)
     out = [replace(each, onsets=one, suspected=exactly) for each in first(modes, others, history)]
-    for k, (t, m, seen, unknown, jump) in enumerate(history.readings):
-        out = [follow(each, t, m, seen, unknown, jump, begun=k == begin) for each in out]
+    for k, reading in enumerate(history.readings):
+        out = followed(out, *reading, begun=k == begin)
     return tuple(out)
 
 
@@ -253,7 +255,7 @@ def transitions(modes: Modes, history: History, age: int, *, ramp: bool = False)
     one = signatures.empty(modes, int(not ramp), int(ramp))
     within, apart = replace(within, onsets=one), APART * np.eye(modes.size)
     for k, (t, m, seen, unknown, jump) in enumerate(history.readings, age - count):
-        out = [follow(each, t, m, seen, unknown, jump) for each in out]
+        out = followed(out, t, m, seen, unknown, jump)
         if k < 0:
             within = follow(within, t, m, seen, unknown, jump)
         elif k < age - 1:
@@ -261,6 +263,36 @@ def transitions(modes: Modes, history: History, age: int, *, ramp: bool = False)
             if (k + 1) & k == 0:
                 out.append(replace(within, transition=k + 1, misfit=0.0, count=0))
     return tuple(out)
+
+
+def followed(  # noqa: PLR0917  # the states, and one tick
+    before: Sequence[Rival],
+    t: float,
+    m: Floats,
+    seen: Bools | None,
+    unknown: Floats | None = None,
+    jump: float = 0.0,
+    *,
+    begun: bool = False,
+) -> list[Rival]:
+    """Take in the residuals of one tick under some models; as `follow`.
+
+    A rival without unrest has the states of the model until its first jump. Such steps are made once.
+    """
+    done: _Done = {}
+    return [follow(each, t, m, seen, unknown, jump, begun=begun, done=done) for each in before]
+
+
+_Done = dict[tuple[int, ...], tuple[Any, ...]]
+"""Results of one tick, with the objects that they follow from, by the identities of these."""
+
+
+def _once(done: _Done, make: Callable[..., Any], *of: object) -> Any:
+    """Result of `make` for some objects, or that of an earlier call with the same ones."""
+    key = tuple(map(id, of))
+    if key not in done:
+        done[key] = make(*of), of
+    return done[key][0]
 
 
 def follow(  # noqa: PLR0917  # the state, and one tick
@@ -272,6 +304,7 @@ def follow(  # noqa: PLR0917  # the state, and one tick
     jump: float = 0.0,
     *,
     begun: bool = False,
+    done: _Done | None = None,
 ) -> Rival:
     """Take in the residuals of one tick.
 
@@ -289,34 +322,32 @@ def follow(  # noqa: PLR0917  # the state, and one tick
         As in `gridsec.estimators.modal.filter.Interval`.
     begun
         The onset is at this tick.
+    done
+        Results of this tick for other models, with the same other arguments; it is changed.
     """
+    done = {} if done is None else done
     modes, state, known, gap = before.modes, before.filter, before.static, Interval(t - before.filter.t, jump)
     total, onsets, suspected, jumps = before.sum, before.onsets, before.suspected, before.jumps
     if state.full is None and not ((seen is None or all_of(seen)) and unknown is None):
         total += _of_theta(modes, known) - before.known
-        if onsets.used[0]:
-            (suspected,) = replay.carried(modes, onsets, known, [0])
-        state = replace(state, full=exact.expanded(modes, state, known))
+        state, suspected = _once(done, _expanded, modes, state, known, onsets)
     size = 0.0
     if jumps is not None:
         size, prior = _jump(modes, state, known, gap, m, seen, unknown)
         total, jumps = total + prior, jumps + (size > 0.0)
         state = _jumped(modes, state, gap, size)
-    state, known, update = exact.step(modes, state, known, t, m, seen, stay=True, unknown=unknown, jump=jump)
+    tick = t, m, seen, unknown, jump, begun
+    state, known, update, onsets, suspected = _once(
+        done, partial(_advanced, tick), modes, state, known, onsets, suspected
+    )
     if update.exact is None:
         count = modes.size
         total -= 0.5 * float((update.innovation**2 / update.variance + np.log(update.variance)).sum())
         # Likelihoods are those of the readings, as with a full covariance.
         total += modes.volume
-        if begun or onsets.used[0]:
-            onsets = signatures.follow(modes, onsets, update, known, gap.h, begun=[0] if begun else [])
     else:
         count = update.exact.white.size
         total -= 0.5 * known.square + float(np.log(update.exact.half.diagonal()).sum())
-        if begun:
-            suspected = replay.begun(modes, 0, bool(onsets.ramp[0]))
-        if suspected is not None:
-            suspected = replay.follow(modes, suspected, update.exact, gap)
     loads = gap.varied(modes, before.loads, before.unrest) + size
     return replace(
         before,
@@ -334,6 +365,36 @@ def follow(  # noqa: PLR0917  # the state, and one tick
         update=update,
         loads=loads,
     )
+
+
+def _expanded(
+    modes: Modes, state: FilterState, known: Static, onsets: Onsets
+) -> tuple[FilterState, Suspected | None]:
+    """State with a full covariance, and the exact scores of the onset so far."""
+    suspected = replay.carried(modes, onsets, known, [0])[0] if onsets.used[0] else None
+    return replace(state, full=exact.expanded(modes, state, known)), suspected
+
+
+def _advanced(  # noqa: PLR0917  # the states, and one tick
+    tick: tuple[float, Floats, Bools | None, Floats | None, float, bool],
+    modes: Modes,
+    state: FilterState,
+    known: Static,
+    onsets: Onsets,
+    suspected: Suspected | None,
+) -> tuple[FilterState, Static, Update, Onsets, Suspected | None]:
+    """The states after one tick, its jump included."""
+    t, m, seen, unknown, jump, begun = tick
+    state, known, update = exact.step(modes, state, known, t, m, seen, stay=True, unknown=unknown, jump=jump)
+    if update.exact is None:
+        if begun or onsets.used[0]:
+            onsets = signatures.follow(modes, onsets, update, known, update.gap.h, begun=[0] if begun else [])
+    else:
+        if begun:
+            suspected = replay.begun(modes, 0, bool(onsets.ramp[0]))
+        if suspected is not None:
+            suspected = replay.follow(modes, suspected, update.exact, update.gap)
+    return state, known, update, onsets, suspected
 
 
 def _of_theta(modes: Modes, known: Static) -> float:

@@ -35,7 +35,7 @@ import numpy as np
 from scipy.linalg import cho_solve, lapack
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.estimators.modal.alike import Alike
+from gridsec.estimators.modal.alike import Alike, opposed
 from gridsec.estimators.modal.costs import (
     BELIEVED,
     SearchProblem,
@@ -329,7 +329,8 @@ def _nearly_alike(best: Tableau, groups: Groups, whole: Floats, read: Bools) -> 
     The descents start with the best set, and without faults other than meters: with its meters, and with
     the relaxations of one prior standard deviation. Powers explain a part of a group, and no step beside
     them is worth its penalty then. The best end is continued from its relaxation. One that costs `FAR` more
-    than the best set, as where amounts differ, is not followed.
+    than the best set, as where amounts differ, is not followed. Where `opposed` shows that of all sets of
+    meters, and the best one has no other faults, none is looked for.
 
     Parameters
     ----------
@@ -342,6 +343,10 @@ def _nearly_alike(best: Tableau, groups: Groups, whole: Floats, read: Bools) -> 
     """
     problem, q, met = best.problem, best.chosen.size, set[bytes]()
     meters, every = np.arange(q) < problem.meters, np.ones(q, dtype=np.bool_)
+    if not best.chosen[~meters].any():
+        amount = (best.amount * best.chosen)[meters]
+        if min(opposed(problem, ALIKE, sign * amount < 0.0, sign) for sign in (1.0, -1.0)) > best.cost + FAR:
+            return best.chosen[None]
 
     def end(start: Bools, used: Bools) -> Alike:
         return descend(Alike(problem, ALIKE, used).pivot(start), groups, met)

@@ -351,6 +351,10 @@ class Joint:
         """Scores (q,) and information (q, q) of columns W (t, q)."""
         return self.score @ W, W.T @ self.information @ W
 
+    def moved(self, modes: Modes, x: Floats) -> Floats:
+        """Change of the means of w and b in the modes by faults x (t, k) at the members, (2, t, k)."""
+        return np.asarray(self.shift @ (modes.U.T @ x))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InModes:

@@ -11,7 +11,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from gridsec.arrays import Bools, Floats, Ints
-from gridsec.estimators.modal.alike import Alike, bounded_minimum
+from gridsec.estimators.modal.alike import Alike, bounded_minimum, opposed
 from gridsec.estimators.modal.costs import SearchProblem, penalties
 from gridsec.estimators.modal.search import ALIKE, search
 from tests.gridsec.estimators.modal.test_costs import problem
@@ -186,3 +186,34 @@ def test_no_set_of_all_is_cheaper_than_the_best_one_beside_an_unread_power(seed:
     sets = np.array(list(product([False, True], repeat=given.y.size)))
     least = min(mixed(best, chosen) for chosen in sets)
     assert mixed(best, found.chosen[0]) == pytest.approx(least, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_opposed_amounts_bound_the_costs_of_all_sets(seed: int) -> None:
+    """All sets of meters by enumeration, and any meters that may oppose the common amount."""
+    given, random = problem(seed), np.random.default_rng(seed)
+    p, none = given.meters, np.zeros(given.y.size - given.meters, dtype=np.bool_)
+    least = min(
+        dense(given, np.append(np.array(some), none))
+        for some in product([False, True], repeat=p)
+        if any(some)
+    )
+    for share in (0.2, 0.5, 1.0):
+        against = random.random(p) < share
+        found = [opposed(given, ALIKE, against, sign) for sign in (1.0, -1.0)]
+        assert np.isfinite(found).all()
+        assert min(found) <= least
+        # Amounts without any prior cost least.
+        free = given.charge.max() - given.y[:p] @ np.linalg.solve(given.F[:p, :p], given.y[:p])
+        assert min(found) >= free - 1e-9
+
+
+def test_amounts_of_both_signs_are_far_from_alike() -> None:
+    """Meters off by 1 and by -1 alternately: both bounds are above the cost of independent amounts."""
+    p = 8
+    amount = np.where(np.arange(p) % 2, 1.0, -1.0)
+    F = 1e4 * np.eye(p)
+    given = SearchProblem(F @ amount, F, np.ones(p), p, np.zeros(p), np.full(p, np.inf))
+    independent = dense(given, np.ones(p, dtype=np.bool_), 0.0)
+    for sign in (1.0, -1.0):
+        assert opposed(given, ALIKE, sign * amount < 0.0, sign) > independent

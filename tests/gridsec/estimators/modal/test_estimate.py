@@ -85,7 +85,7 @@ def test_equals_the_joint_gaussian(fault: str) -> None:
         now = signatures.joint(made, rows, more, 0)
         y, F = now.of(W)
         problem = SearchProblem(y, F, np.array([std]), 1, np.zeros(1), np.full(1, np.inf))
-        T = estimate.moves(made, prepared, state, now, W, effect)
+        T = estimate.moves(made, prepared, state, now, G, effect)
         one = Identification(
             np.ones((1, 1), bool), np.zeros(1, np.intp), np.ones(1), np.ones(1, bool), (problem,)
         )

@@ -296,3 +296,24 @@ def test_no_load_is_adopted_while_a_meter_is_doubted() -> None:
         state, evidence = core.step(kernel, state, float(k), m)
     suspicion = core.identify(kernel, state, evidence)
     assert core.adopt(kernel, state, suspicion) is state
+
+
+@pytest.mark.parametrize("onset", [10, 20])
+def test_steps_that_rivals_share_are_those_of_each(onset: int) -> None:
+    """The model and its rivals with a jump, an onset and missing readings, together and one by one."""
+    kernel = core.assemble(MODEL, STEPS_OF_PLACES, np.full(12, 0.1), gamma=1e6)
+    source, jump = Source(MODEL, np.random.default_rng(3)), 0.02 * np.ones(12)
+    each = rivals.first(kernel.modes, kernel.rivals, core.init(kernel, 0.0).history)
+    together, shared = list(each), 0
+    for k in range(30):
+        seen = np.arange(12) != 5 if k >= 15 else None
+        tick = float(k), source.tick() + jump * (k >= 25), seen
+        each = [rivals.follow(one, *tick, begun=k == onset) for one in each]
+        together = rivals.followed(together, *tick, begun=k == onset)
+        shared += together[0].filter is together[1].filter
+        for one, other in zip(each, together, strict=True):
+            assert (one.evidence, one.misfit, one.jumps) == (other.evidence, other.misfit, other.jumps)
+            assert (one.filter.mean == other.filter.mean).all()
+            if k >= onset:
+                assert (one.scored().information == other.scored().information).all()
+    assert 15 <= shared < 30
