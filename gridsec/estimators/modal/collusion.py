@@ -33,7 +33,9 @@ is a minimum over z >= 0 of all usable meters, ``z' F z / 2 - z' y``, a bound. W
 of a naming, the meters with the largest z are the only g. Elsewhere the relaxation's solution orders the
 meters, and the best beginning of this order is improved by single meters and by exchanges. x is first the
 mean amount of C, then that of the set found. Where that gains nothing and the solution has more meters than
-the promise, x is larger. Where the best g has meters of C, the best one without them is also found.
+the promise, x is larger. Where the best g has meters of C, the best one without them is also found. g is also
+looked for in place of the rest's meters of its own sign, since colluding meters may share one amount, and of
+its faults that are no meters.
 
 Before all that, one bound of L excludes most C (`_Loose`): any amounts of all other meters, and amounts of
 the reverse sign of C. It takes one inverse of F for all C, and a problem of the size of C each.
@@ -261,23 +263,33 @@ class _Case:
         problem, p, rest, masked = self.problem, self.problem.meters, self.rest, self.masked
         size = float(np.abs(self.amount[self.accused]).mean())
         yield without, rest
-        at, y, F = _beside(problem, rest, ~rest[:p])
-        room = self.most - int(np.count_nonzero(rest[:p] | masked))
-        s2, own, kept = float(problem.std[0]) ** 2, self.meters[at], []
-        for sign in _SIGNS:
-            relaxed = _Relaxed(sign * y, F, s2, ~masked[at], room)
-            # The best set without any of them may keep more names.
-            for barred in (np.zeros_like(own), own) if sign == -self.sign else (own,):
-                least, inside = relaxed.found(size, barred, limit + ALIKE_LESS - without)
-                if any_of(inside):
-                    both = rest.copy()
-                    both[at[inside]] = True
-                    kept.append(both)
-                    yield without + least, both
-                if least == inf or not any_of(inside & own):
-                    break
+        kept = []
+        for each, signs in self._beginnings():
+            at, y, F = _beside(problem, each, ~each[:p])
+            room = self.most - int(np.count_nonzero(each[:p] | masked))
+            begun = without if np.array_equal(each, rest) else float(_evidence(problem, each[None])[0])
+            s2, own = float(problem.std[0]) ** 2, self.meters[at]
+            for sign in signs:
+                relaxed = _Relaxed(sign * y, F, s2, ~masked[at], room)
+                # The best set without any of them may keep more names.
+                for barred in (np.zeros_like(own), own) if sign == -self.sign else (own,):
+                    least, inside = relaxed.found(size, barred, limit + ALIKE_LESS - begun)
+                    if any_of(inside):
+                        both = each.copy()
+                        both[at[inside]] = True
+                        kept.append(both)
+                        yield begun + least, both
+                    if least == inf or not any_of(inside & own):
+                        break
         if kept:
             yield from zip(_evidence(problem, np.stack(kept)).tolist(), kept, strict=True)
+
+    def _beginnings(self) -> list[tuple[Bools, tuple[float, ...]]]:
+        """Sets that others are added to, (q,), and the signs of these: the rest, and parts of it."""
+        rest, meter = self.rest, np.arange(self.J.size) < self.problem.meters
+        fewer: list[tuple[Bools, tuple[float, ...]]] = [(rest & meter, _SIGNS)]
+        fewer += [(rest & ~(meter & (sign * self.amount > 0.0)), (sign,)) for sign in _SIGNS]
+        return [(rest, _SIGNS), *(one for one in fewer if not np.array_equal(one[0], rest))]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,7 +5,7 @@ Where the meters ``J & g`` are off by one amount x, the meters ``g - J`` differ 
 lies outside of g tells which of both are right. Unread powers, unlearned classes and large loads hide that.
 No prior of meters may decide then: the mirror image has the penalty of J,
 
-    cost(J') = cost(J) + L(J') - min(L(J), L_one(J)),     L = -y' (F + V^-1)^-1 y + log det(1 + V F)
+    cost(J') = cost(J) + max(0, L(J') - min(L(J), L_one(J))),     L = -y' (F + V^-1)^-1 y + log det(1 + V F)
 
 with L(J') and L_one(J) of one amount for the exchanged meters. So readings alone decide between both. L is
 the mean of the likelihoods with independent amounts V and with amounts alike, as in `search`, for all sets.
@@ -108,7 +108,8 @@ def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iter
             yield image, max(more, 0.0) + _apart(likelihood, chosen & image, column)
     # What lies outside of a lateral is one, too: that of more meters than are promised has no image.
     outside = ~near.laterals & read
-    few = np.count_nonzero(outside ^ chosen[:p], axis=1) <= near.most
+    kept = np.count_nonzero(chosen[:p]) + np.count_nonzero(chosen[-b:]) <= near.most
+    few = kept & (np.count_nonzero(outside ^ chosen[:p], axis=1) <= near.most)
     laterals = np.vstack([near.laterals & read, outside[few]])
     sets = np.unique(np.hstack([laterals & ~chosen[:p], laterals & chosen[:p]]), axis=0)
     sets = sets[sets[:, :p].any(axis=1) & sets[:, p:].any(axis=1)]
@@ -122,7 +123,8 @@ def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iter
         if not powers:
             dropped = float(problem.charge[p:-b] @ chosen[p:-b])
             rest[:, p:-b] = False
-        images, more_of = rest.copy(), likelihood(rest, others) - own - dropped
+        # No image is likelier than its set: with the penalty of one meter it may have most of them.
+        images, more_of = rest.copy(), np.maximum(likelihood(rest, others) - own - dropped, 0.0)
         images[:, :p] |= others
         yield from zip(images, more_of.tolist(), strict=True)
 

@@ -15,7 +15,7 @@ A step, by module:
 
 The residual of a meter is its squared reading less the model; fixed errors are states of the filter.
 Registers err in proportion to v2: with b at 1 pu, ``b (v2 - 1)`` by the mean of b before the tick is no part
-of the residual. A meter is named when one search names it as the only fault with two readings, when `CONFIRM`
+of the residual. A meter is named when one search names it as the only fault with two readings, when
 searches in turn have it in their likeliest explanations, when it repeats its readings beyond chance, or when
 it reads more than a voltage can be. Others of its explanation may delay it (`naming`). Named meters are
 masked from the onset on, and released by their readings (`masking`). The busbar's meter is named by searches

@@ -37,15 +37,19 @@ from gridsec.estimators.modal.search import SOME, Identification, mixed
 TAP = 0.05
 """Largest step of a tap changer, squared pu: 2.5 % of the voltage."""
 CONFIRM = 2
-"""Searches in turn that accuse one of several faults before it is named, and readings of a sole one."""
-APART = 2 * CONFIRM
-"""Searches in turn after which a meter is named beside others that are not confirmed yet."""
-WHOLE = 8 * CONFIRM
+"""Readings of a sole fault before it is named, and searches in turn that accuse one of several."""
+SEVERAL = 4
+"""Searches in turn before a meter is named beside others without a name, or in a doubtful explanation.
+
+An explanation is doubtful below the weight `KEEPS`. With fewer searches a part of a third is masked first,
+and takes the evidence of the rest away.
+"""
+WHOLE = 4 * SEVERAL
 """Searches in turn after which meters are masked even if others explain the rest without their readings."""
 SURE = 0.95
 """Least weight of the rest of an explanation that its masked meters do not leave behind, 1."""
 KEEPS = 0.5
-"""Least weight of such a rest without the readings of the masked meters, 1: it stays likelier than not."""
+"""Least weight of an explanation that is likelier than not, 1."""
 FLAT = 1e-6
 """Prior information of the amounts of masked meters, in that of the prior, 1: rounding."""
 
@@ -86,9 +90,8 @@ def confirmed(found: Identification, named: Bools, streak: Ints, since: Sequence
         readings = sum(seen is None or all_of(seen[named]) for _, _, seen, *_ in since)
         if readings >= CONFIRM:
             return named
-    # Without a part of the meters, other faults may explain the rest: a few more searches may name all.
-    least = CONFIRM if all_of(streak[named] >= CONFIRM) else APART
-    return np.asarray(named & (streak >= least))
+    sure = found.weight[0] >= KEEPS and all_of(streak[named] >= CONFIRM)
+    return np.asarray(named & (streak >= (CONFIRM if sure else SEVERAL)))
 
 
 def alone(found: Identification, masked: Bools) -> Bools:

@@ -9,7 +9,7 @@ import pytest
 
 from gridsec.arrays import Bools
 from gridsec.estimators.modal.monitor import design, init, own_errors, step
-from gridsec.estimators.modal.naming import APART, CONFIRM, confirmed
+from gridsec.estimators.modal.naming import CONFIRM, SEVERAL, confirmed
 from gridsec.estimators.modal.replay import Reading
 from gridsec.estimators.modal.search import Identification
 from gridsec.estimators.modal.verdict import combined
@@ -52,18 +52,22 @@ def test_one_reading_of_the_meter_is_not_enough(since: list[Reading]) -> None:
 
 @pytest.mark.parametrize("faults", [(1, 2), (2, 5), (2, 6)], ids=["meter", "power", "busbar"])
 def test_a_part_of_several_faults_needs_searches_in_turn(faults: tuple[int, ...]) -> None:
+    """Two of them, and `SEVERAL` where the explanation is less likely than not."""
     several, since = found(*faults), ticks(None, None, None)
     named = replace(several, named=mask(2)).named
     assert not confirmed(several, named, NONE + named, since).any()
     assert confirmed(several, named, CONFIRM * named, since).tolist() == named.tolist()
+    doubtful = replace(several, weight=np.full(1, 0.4))
+    assert not confirmed(doubtful, named, (SEVERAL - 1) * named, since).any()
+    assert confirmed(doubtful, named, SEVERAL * named, since).tolist() == named.tolist()
 
 
 def test_meters_that_are_named_by_turns_of_different_length_are_apart() -> None:
-    """An explanation is named whole; after `APART` searches in turn a meter is named by itself."""
+    """An explanation is named whole; after `SEVERAL` searches in turn a meter is named by itself."""
     streak, since = CONFIRM * mask(1) + mask(3), ticks(None, None)
     assert confirmed(found(1, 3), mask(1, 3), streak + mask(3), since).tolist() == mask(1, 3).tolist()
     assert not confirmed(found(1, 3), mask(1, 3), streak, since).any()
-    later = streak + (APART - CONFIRM) * mask(1)
+    later = streak + (SEVERAL - CONFIRM) * mask(1)
     assert confirmed(found(1, 3), mask(1, 3), later, since).tolist() == mask(1).tolist()
 
 

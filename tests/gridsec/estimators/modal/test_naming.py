@@ -67,7 +67,7 @@ def test_a_part_is_not_masked_where_a_power_then_explains_the_rest() -> None:
     found = two(given, all_meters, with_power, 0.01)
     assert not naming.separable(found, mask(0, 1), NO_LATERALS)
     assert naming.separable(found, mask(*range(8)), NO_LATERALS)
-    streak = np.full(8, naming.CONFIRM)
+    streak = np.full(8, naming.SEVERAL)
     assert not naming.final(found, mask(0, 1), streak, (), NO_LATERALS).any()
     later = np.full(8, naming.WHOLE)
     assert naming.final(found, mask(0, 1), later, (), NO_LATERALS).tolist() == mask(0, 1).tolist()
@@ -79,7 +79,9 @@ def test_a_part_is_masked_where_the_rest_stays_likely() -> None:
     given = replace(given, y=np.where(mask(2, 6, size=10), 300.0, 0.0), F=100.0 * np.eye(10))
     found = two(given, mask(2, 6, size=10), mask(2, size=10), 1e-4)
     assert naming.separable(found, mask(2), NO_LATERALS)
-    assert naming.final(found, mask(2), np.full(8, 2), (), NO_LATERALS).tolist() == mask(2).tolist()
+    assert (
+        naming.final(found, mask(2), np.full(8, naming.SEVERAL), (), NO_LATERALS).tolist() == mask(2).tolist()
+    )
 
 
 def test_a_part_is_not_masked_where_the_rest_would_count_as_honest() -> None:
