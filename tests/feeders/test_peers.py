@@ -147,7 +147,7 @@ def test_peers_are_compared_in_the_snapshots_that_both_have_seen(tmp_path: Path)
 _OPEN = pytest.mark.xfail(reason="`modal` leaves a false report beside false voltages open")
 
 
-@pytest.mark.parametrize("trial", [0, 3, pytest.param(6, marks=_OPEN)])
+@pytest.mark.parametrize("trial", [0, 3, 6])
 def test_honest_meters_that_contradict_a_false_power_are_not_accused_for_being_many(trial: int) -> None:
     """Three of thirteen tell of a load that one of them reports; ten were accused once, being no dearer."""
     cell = Cell(FEEDER, 0.001, 0.1, "coord+pq", 3)

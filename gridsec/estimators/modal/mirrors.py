@@ -5,14 +5,14 @@ Where the meters ``J & g`` are off by one amount x, the meters ``g - J`` differ 
 lies outside of g tells which of both are right. Unread powers, unlearned classes and large loads hide that.
 No prior of meters may decide then: the mirror image has the penalty of J,
 
-    cost(J') = cost(J) + max(0, L(J') - min(L(J), L_one(J))),     L = -y' (F + V^-1)^-1 y + log det(1 + V F)
+    cost(J') = cost(J) + L(J') - min(L(J), L_one(J)),     L = -y' (F + V^-1)^-1 y + log det(1 + V F)
 
 with L(J') and L_one(J) of one amount for the exchanged meters. So readings alone decide between both. L is
 the mean of the likelihoods with independent amounts V and with amounts alike, as in `search`, for all sets.
 
 **Laterals.** ``J' = J xor g``, with and without the false powers of J, for every group of neighbours but the
-whole feeder, and for all others where J' has no more meters than are promised. A majority of a lateral that
-agrees is believed only as far as others confirm it.
+whole feeder, and for all other meters where J and J' keep the promise. A majority of a lateral that agrees is
+believed only as far as others confirm it. Beside the busbar's meter J' has at most M meters.
 
 **Phases.** A phase of the busbar off by x, with meters A of the phase off by -x, has the same residuals as
 the other meters of the phase off by -x: L is the same. The promise "at most M manipulated meters" excludes
@@ -106,11 +106,13 @@ def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iter
                 )
                 more = float(both[1] - both[0] + problem.charge[image].sum() - problem.charge[chosen].sum())
             yield image, max(more, 0.0) + _apart(likelihood, chosen & image, column)
-    # What lies outside of a lateral is one, too: that of more meters than are promised has no image.
-    outside = ~near.laterals & read
-    kept = np.count_nonzero(chosen[:p]) + np.count_nonzero(chosen[-b:]) <= near.most
-    few = kept & (np.count_nonzero(outside ^ chosen[:p], axis=1) <= near.most)
-    laterals = np.vstack([near.laterals & read, outside[few]])
+    # What lies outside of a lateral is one, too, within the promise. A majority beside the busbar's meter is no
+    # image: the level of all meters is unknown there.
+    inside, outside = near.laterals & read, ~near.laterals & read
+    few, others = (np.count_nonzero(each ^ chosen[:p], axis=1) <= near.most for each in (inside, outside))
+    busbar = np.count_nonzero(chosen[-b:])
+    kept = np.count_nonzero(chosen[:p]) + busbar <= near.most
+    laterals = np.vstack([inside[few | (busbar == 0)], outside[kept & others]])
     sets = np.unique(np.hstack([laterals & ~chosen[:p], laterals & chosen[:p]]), axis=0)
     sets = sets[sets[:, :p].any(axis=1) & sets[:, p:].any(axis=1)]
     rest = np.tile(chosen, (len(sets), 1))
@@ -123,8 +125,7 @@ def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iter
         if not powers:
             dropped = float(problem.charge[p:-b] @ chosen[p:-b])
             rest[:, p:-b] = False
-        # No image is likelier than its set: with the penalty of one meter it may have most of them.
-        images, more_of = rest.copy(), np.maximum(likelihood(rest, others) - own - dropped, 0.0)
+        images, more_of = rest.copy(), likelihood(rest, others) - own - dropped
         images[:, :p] |= others
         yield from zip(images, more_of.tolist(), strict=True)
 

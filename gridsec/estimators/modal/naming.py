@@ -39,11 +39,7 @@ TAP = 0.05
 CONFIRM = 2
 """Readings of a sole fault before it is named, and searches in turn that accuse one of several."""
 SEVERAL = 4
-"""Searches in turn before a meter is named beside others without a name, or in a doubtful explanation.
-
-An explanation is doubtful below the weight `KEEPS`. With fewer searches a part of a third is masked first,
-and takes the evidence of the rest away.
-"""
+"""Searches in turn before a meter is named beside others that are not confirmed yet."""
 WHOLE = 4 * SEVERAL
 """Searches in turn after which meters are masked even if others explain the rest without their readings."""
 SURE = 0.95
@@ -90,8 +86,9 @@ def confirmed(found: Identification, named: Bools, streak: Ints, since: Sequence
         readings = sum(seen is None or all_of(seen[named]) for _, _, seen, *_ in since)
         if readings >= CONFIRM:
             return named
-    sure = found.weight[0] >= KEEPS and all_of(streak[named] >= CONFIRM)
-    return np.asarray(named & (streak >= (CONFIRM if sure else SEVERAL)))
+    # Without a part of the meters, other faults may explain the rest: a few more searches may name all.
+    least = CONFIRM if all_of(streak[named] >= CONFIRM) else SEVERAL
+    return np.asarray(named & (streak >= least))
 
 
 def alone(found: Identification, masked: Bools) -> Bools:

@@ -52,14 +52,10 @@ def test_one_reading_of_the_meter_is_not_enough(since: list[Reading]) -> None:
 
 @pytest.mark.parametrize("faults", [(1, 2), (2, 5), (2, 6)], ids=["meter", "power", "busbar"])
 def test_a_part_of_several_faults_needs_searches_in_turn(faults: tuple[int, ...]) -> None:
-    """Two of them, and `SEVERAL` where the explanation is less likely than not."""
     several, since = found(*faults), ticks(None, None, None)
     named = replace(several, named=mask(2)).named
     assert not confirmed(several, named, NONE + named, since).any()
     assert confirmed(several, named, CONFIRM * named, since).tolist() == named.tolist()
-    doubtful = replace(several, weight=np.full(1, 0.4))
-    assert not confirmed(doubtful, named, (SEVERAL - 1) * named, since).any()
-    assert confirmed(doubtful, named, SEVERAL * named, since).tolist() == named.tolist()
 
 
 def test_meters_that_are_named_by_turns_of_different_length_are_apart() -> None:
