@@ -31,7 +31,8 @@ has the relaxation
 which is convex (`alike.bounded_minimum`). With any amounts of the sign, and independent ones of the rest, it
 is a minimum over z >= 0 of all usable meters, ``z' F z / 2 - z' y``, a bound. Where that is above the limit
 of a naming, the meters with the largest z are the only g. Elsewhere the relaxation's solution orders the
-meters, and the best beginning of this order is improved by single meters and by exchanges. x is first the
+meters, and the best beginning of this order is improved by single meters and by exchanges, and so are the
+best of the laterals and of such sets of earlier searches. x is first the
 mean amount of C, then that of the set found. Where that gains nothing and the solution has more meters than
 the promise, x is larger. Where the best g has meters of C, the best one without them is also found. g is also
 looked for in place of the rest's meters of its own sign, since colluding meters may share one amount, and of
@@ -43,7 +44,7 @@ the reverse sign of C. It takes one inverse of F for all C, and a problem of the
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import inf, log
 from typing import Self
@@ -79,6 +80,8 @@ _COUNTS = -2.0 * log(2.0 * DOUBT)
 """Largest cost of a set that contests a name: twice the weight from which on a set counts in the variance."""
 OPEN = 2.0
 """Share that a true set leaves open, in that of the set that suits the readings best, 1."""
+STARTS = 4
+"""Sets of earlier searches and laterals that are improved besides those of the relaxation, 1."""
 ALIKE_LESS = 3.0
 """Amount by which L with amounts alike may be below the bound of independent ones, 1: 2 log 2, and more."""
 
@@ -107,6 +110,7 @@ def weighed(
     masked: Bools,
     near: Neighbourhoods,
     left: float = inf,
+    known: Sequence[Bools] = (),
 ) -> Weighed:
     """Explanations with sets of meters that may replace accused ones.
 
@@ -120,6 +124,8 @@ def weighed(
         Laterals, and the largest number of manipulated meters that is promised.
     left
         Share of the misfit that the likeliest explanation leaves.
+    known : (q,) each
+        Such sets of earlier searches.
     """
     p, J = found.named.size, found.chosen[0]
     first = J.size - near.phases.shape[1]
@@ -141,7 +147,8 @@ def weighed(
     sets = [fresh & (sign * amount > 0.0) for sign in _SIGNS]
     sets += [np.arange(J.size) == k for k in np.flatnonzero(J[first:]) + first]
     whole, loose = float(_evidence(problem, J[None])[0]), _Loose.of(problem, J)
-    every = _Case(problem, J, amount, J, masked, most, min(MISFIT, OPEN * left), whole, loose)
+    begun = np.vstack([near.laterals, *(each[:p] for each in known)])
+    every = _Case(problem, J, amount, J, masked, most, begun, min(MISFIT, OPEN * left), whole, loose)
     cases = [(replace(every, accused=each), SPLITS) for each in sets]
     while cases:
         case, splits = cases.pop()
@@ -184,6 +191,8 @@ class _Case:
         Masked meters.
     most
         Largest number of manipulated meters that is promised.
+    known : (k, p)
+        Sets of meters from which g is looked for, besides those of the relaxation.
     left
         Share of the evidence that J leaves open.
     whole
@@ -198,6 +207,7 @@ class _Case:
     accused: Bools
     masked: Bools
     most: int
+    known: Bools
     left: float
     whole: float
     loose: _Loose | None
@@ -270,7 +280,7 @@ class _Case:
             begun = without if np.array_equal(each, rest) else float(_evidence(problem, each[None])[0])
             s2, own = float(problem.std[0]) ** 2, self.meters[at]
             for sign in signs:
-                relaxed = _Relaxed(sign * y, F, s2, ~masked[at], room)
+                relaxed = _Relaxed(sign * y, F, s2, ~masked[at], room, self.known[:, at])
                 # The best set without any of them may keep more names.
                 for barred in (np.zeros_like(own), own) if sign == -self.sign else (own,):
                     least, inside = relaxed.found(size, barred, limit + ALIKE_LESS - begun)
@@ -438,6 +448,8 @@ class _Relaxed:
         Meters that count in the size of a set.
     room
         Largest number of these.
+    known : (n, k)
+        Sets that are improved besides the relaxation's.
     """
 
     y: Floats
@@ -445,11 +457,13 @@ class _Relaxed:
     s2: float
     counted: Bools
     room: int
+    known: Bools
 
     def found(self, amount: float, barred: Bools, limit: float) -> tuple[float, Bools]:
         """Least fit without the meters barred, (k,), and its set; infinite where the bound excludes all."""
         n, out = np.flatnonzero(~barred), np.zeros_like(barred)
-        part = _Relaxed(self.y[n], submatrix(self.F, n, n), self.s2, self.counted[n], self.room)
+        F, known = submatrix(self.F, n, n), self.known[:, n]
+        part = _Relaxed(self.y[n], F, self.s2, self.counted[n], self.room, known)
         least, inside = part.bound()
         least, inside = part.best(amount) if least < limit else (inf, inside)
         out[n[inside]] = True
@@ -461,9 +475,11 @@ class _Relaxed:
         if not best.size or self.room <= 0:
             return least, best
         start, tried = np.full(best.size, HALF), amount
+        known = self._known()
         for _ in range(ROUNDS):
             share, before, now = self._share(amount, start), least, 0.0
-            end = _Limited(self, self._rounded(share)).descend()
+            end = _Limited(self, np.vstack([self._rounded(share), known])).descend()
+            known = known[:0]
             one = int(end.cost.argmin())
             if end.cost[one] < least:
                 least, best = float(end.cost[one]), end.inside[one]
@@ -476,6 +492,14 @@ class _Relaxed:
             start, amount = np.clip(share * amount / now, 0.0, 1.0), now
             tried = max(tried, now)
         return least, best
+
+    def _known(self) -> Bools:
+        """Known sets with the best fits, (n, k)."""
+        count = np.count_nonzero(self.known & self.counted, axis=1)
+        some = np.unique(self.known[(count <= self.room) & self.known.any(axis=1)], axis=0)
+        one = _OneSign(self.y, self.F, self.s2, some[:0])
+        fit = one.fit(some @ self.y, np.vecdot(some @ self.F, some))
+        return np.asarray(some[np.argsort(fit, kind="stable")[:STARTS]])
 
     def _rounded(self, share: Floats) -> Bools:
         """Beginnings of the order by the shares: the best one, the larger half, and the longest, (n, k)."""

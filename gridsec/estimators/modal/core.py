@@ -617,7 +617,7 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     age = int(test.onsets.age[rows[best]])
     found = mirrors.reflected(found, core.near)
     replacing = () if before is None else before.replacing
-    weighed = collusion.weighed(found, state.masked.meters, core.near, _left(state, found, age))
+    weighed = collusion.weighed(found, state.masked.meters, core.near, _left(state, found, age), replacing)
     sets = {each.tobytes(): each for each in (*weighed.replacing, *replacing)}
     found, replacing = weighed.found, tuple(sets.values())[:RECALLED]
     share = _explained(state, found, age)

@@ -60,6 +60,7 @@ def some(*meters: int) -> Bools:
 
 NONE = some()
 NOT_FIRST = ~some(0, 1, 2, 3)
+NO_SETS = np.zeros((0, METERS), dtype=np.bool_)
 
 
 def test_the_evidence_is_the_cost_without_the_penalty_of_meters() -> None:
@@ -80,7 +81,7 @@ def test_the_set_with_one_amount_is_the_best_of_all(seed: int) -> None:
     given, room = street(0.8 * some(0, 1, 2, 3).astype(np.float64), seed), 4
     own, barred = np.append(some(7), False), some(11)
     at, y, F = collusion._beside(given, own, ~(own[:METERS] | barred))
-    found = collusion._Relaxed(y, F, 1.0, np.ones(at.size, dtype=np.bool_), room)
+    found = collusion._Relaxed(y, F, 1.0, np.ones(at.size, dtype=np.bool_), room, NO_SETS[:, : at.size])
     least, inside = found.best(0.5)
     assert set(at.tolist()) == set(range(METERS)) - {7, 11}
 
@@ -109,7 +110,7 @@ def test_a_relaxation_of_too_many_meters_is_solved_for_larger_amounts(amount: fl
     lie = np.isin(np.arange(p), rng.permutation(10)[:7])
     F = np.linalg.inv(V)
     y = F @ (0.8 * lie + np.linalg.cholesky(V) @ rng.standard_normal(p))
-    relaxed = collusion._Relaxed(y, F, 1.0, np.ones(p, dtype=np.bool_), 7)
+    relaxed = collusion._Relaxed(y, F, 1.0, np.ones(p, dtype=np.bool_), 7, np.zeros((0, p), dtype=np.bool_))
     assert relaxed._share(amount, np.full(p, 0.5)).sum() > 7.0
     least, inside = relaxed.best(amount)
     assert (inside == lie).all()
@@ -122,7 +123,7 @@ def test_the_bound_is_that_of_all_amounts_of_the_sign(seed: int, sign: float) ->
     """Against nonnegative least squares, and below the fits of all sets that a search finds."""
     given, own = street(0.8 * some(0, 1, 2, 3).astype(np.float64), seed), np.append(some(7), False)
     at, y, F = collusion._beside(given, own, ~own[:METERS])
-    relaxed = collusion._Relaxed(sign * y, F, 1.0, np.ones(at.size, dtype=np.bool_), 4)
+    relaxed = collusion._Relaxed(sign * y, F, 1.0, np.ones(at.size, dtype=np.bool_), 4, NO_SETS[:, : at.size])
     root = np.linalg.cholesky(F)
     aim = np.linalg.solve(root, sign * y)
     rest = nnls(root.T, aim)[1]
@@ -131,6 +132,19 @@ def test_the_bound_is_that_of_all_amounts_of_the_sign(seed: int, sign: float) ->
     assert bound <= relaxed.best(0.5)[0]
     order = np.argsort(-nnls(root.T, aim)[0], kind="stable")
     assert set(np.flatnonzero(inside)) <= set(order[:4])
+
+
+def test_a_known_set_is_improved_within_the_promise() -> None:
+    """A set near the lie leads there; sets of more meters and of none are left out."""
+    given = street(0.8 * some(0, 1, 2, 3).astype(np.float64))
+    at, y, F = collusion._beside(given, np.zeros(METERS + 1, dtype=np.bool_), ~NONE)
+    every = np.ones(at.size, dtype=np.bool_)
+    beginning = np.stack([some(0, 1, 2, 6), some(*range(6)), NONE])
+    known = collusion._Relaxed(y, F, 1.0, every, 4, beginning)
+    assert known._known().tolist() == [some(0, 1, 2, 6).tolist()]
+    least, inside = known.best(0.8)
+    assert inside.tolist() == some(0, 1, 2, 3).tolist()
+    assert np.isclose(least, collusion._Limited(known, inside[None]).cost[0], rtol=1e-12)
 
 
 def test_sets_that_keep_names_are_told_for_the_next_search() -> None:
