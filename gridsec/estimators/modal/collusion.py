@@ -23,6 +23,11 @@ names none.
 with the most of C, but not all, splits it. Both parts are checked by themselves, and split again up to
 `SPLITS` times: honest meters that seem off together are neighbours.
 
+**False powers.** A coalition of customers that also report false powers can imitate a false power elsewhere
+beside an honest meter. Where J has faults that are no meters, customers with a false reading and a false
+power each, without a charge, are looked for in place of C and of these faults, the busbar and inverters
+included. The customer with possible amounts that lowers L most is added until none lowers it.
+
 **Search of g.** Given the amounts of the rest J - C, g has the information F and the scores y. One amount x
 has the relaxation
 
@@ -46,6 +51,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from math import inf, log
 from typing import Self
 
@@ -148,7 +154,9 @@ def weighed(
     sets += [np.arange(J.size) == k for k in np.flatnonzero(J[first:]) + first]
     whole, loose = float(_evidence(problem, J[None])[0]), _Loose.of(problem, J)
     begun = np.vstack([near.laterals, *(each[:p] for each in known)])
-    every = _Case(problem, J, amount, J, masked, most, begun, min(MISFIT, OPEN * left), whole, loose)
+    every = _Case(
+        problem, J, amount, J, masked, most, near.powers, begun, min(MISFIT, OPEN * left), whole, loose
+    )
     cases = [(replace(every, accused=each), SPLITS) for each in sets]
     while cases:
         case, splits = cases.pop()
@@ -191,6 +199,8 @@ class _Case:
         Masked meters.
     most
         Largest number of manipulated meters that is promised.
+    powers : (p,)
+        Fault of each meter's customer that is its false power.
     known : (k, p)
         Sets of meters from which g is looked for, besides those of the relaxation.
     left
@@ -207,6 +217,7 @@ class _Case:
     accused: Bools
     masked: Bools
     most: int
+    powers: Ints
     known: Bools
     left: float
     whole: float
@@ -230,15 +241,15 @@ class _Case:
     def contesting(self) -> list[tuple[float, Bools]]:
         """Differences of L from J, and sets (q,) that keep names of C: those without any of C, then by L."""
         without = float(_evidence(self.problem, self.rest[None])[0])
-        if self.loose is not None:
-            least = self.loose.without(self.accused, self.sign)
-            if least > self._limit(self.whole, without) + ALIKE_LESS:
-                return []
+        excluded = self.loose is not None and (
+            self.loose.without(self.accused, self.sign) > self._limit(self.whole, without) + ALIKE_LESS
+        )
+        if excluded and not any_of(self.J[self.problem.meters :]):
+            return []
         own = self.own(without)
         limit = self._limit(own, without)
-        found = [
-            (any_of(self.accused & one[1]), *one) for one in self.instead(without, limit) if one[0] < limit
-        ]
+        sets = chain(() if excluded else self.instead(without, limit), self.customers())
+        found = [(any_of(self.accused & one[1]), *one) for one in sets if one[0] < limit]
         if not found:
             return []
         found.sort(key=lambda one: one[:2])
@@ -293,6 +304,33 @@ class _Case:
                         break
         if kept:
             yield from zip(_evidence(problem, np.stack(kept)).tolist(), kept, strict=True)
+
+    def customers(self) -> Iterator[tuple[float, Bools]]:
+        """L of customers with false readings and powers in place of C, and the sets, (q,)."""
+        problem, rest, masked, powers = self.problem, self.rest, self.masked, self.powers
+        p = problem.meters
+        if not any_of(self.J[p:]):
+            return
+        charge = problem.charge.copy()
+        charge[powers] = 0.0
+        free, chosen = replace(problem, charge=charge), rest & (np.arange(rest.size) < p)
+        # The powers of masked customers are free, too.
+        least, usable = float(_evidence(free, chosen[None])[0]), (informed(problem) | masked) & ~self.meters
+        while True:
+            added = np.flatnonzero(usable & ~chosen[powers])
+            sets = np.repeat(chosen[None], added.size, axis=0)
+            sets[np.arange(added.size), added] = sets[np.arange(added.size), powers[added]] = True
+            sets = sets[np.count_nonzero(sets[:, :p] | masked, axis=1) <= self.most]
+            each = _evidence(free, sets) if len(sets) else np.zeros(0)
+            order = [k for k in np.argsort(each, kind="stable").tolist() if each[k] < least - GAIN]
+            possible = (
+                k for k in order if not any_of(np.abs(mean_amounts(free, sets[k])) > free.bound[sets[k]])
+            )
+            best = next(possible, None)
+            if best is None:
+                return
+            chosen, least = sets[best], float(each[best])
+            yield least, chosen
 
     def _beginnings(self) -> list[tuple[Bools, tuple[float, ...]]]:
         """Sets that others are added to, (q,), and the signs of these: the rest, and parts of it."""

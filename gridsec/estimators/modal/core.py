@@ -191,6 +191,7 @@ def assemble(
     attacked: int | None = None,
     inverters: tuple[Floats, Floats] | None = None,
     allowed: Floats | None = None,
+    customers: Ints | None = None,
 ) -> Core:
     """Prepare a core.
 
@@ -210,6 +211,8 @@ def assemble(
         Effect of their injections on all places, squared pu per pu, and their ranges, pu; None: none.
     allowed : (p,)
         Largest fixed error within the class of each meter, squared pu; None: no bound.
+    customers : (p,)
+        Customer of each meter; None: the first p in their order.
 
     Raises
     ------
@@ -231,7 +234,7 @@ def assemble(
         effect=np.hstack([np.zeros((len(powers), at.size)), powers, model.busbar_of[:, used]]),
         faults=signatures.columns(made, powers[at], std, SIZE),
         groups=groups(made),
-        near=mirrors.neighbourhoods(made, max(1, at.size // 3) if attacked is None else attacked),
+        near=mirrors.neighbourhoods(made, max(1, at.size // 3) if attacked is None else attacked, customers),
         estimator=estimates.estimator(made),
         bound=np.concatenate([np.full(at.size, inf), most, np.full(int(used.sum()), inf)]),
         limit=log(gamma),
@@ -264,6 +267,7 @@ def design(front: FrontDesign, most: Floats | None = None) -> Core:
         attacked=front.max_attacked,
         inverters=inverters if droop.customer.size else None,
         allowed=front.allowed,
+        customers=front.plant.meters,
     )
 
 

@@ -29,7 +29,7 @@ from math import inf
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, any_of
+from gridsec.arrays import Bools, Floats, Ints, any_of
 from gridsec.estimators.modal.alike import Alike
 from gridsec.estimators.modal.costs import (
     SearchProblem,
@@ -62,20 +62,24 @@ class Neighbourhoods:
         Meters of each phase of the busbar.
     most
         Largest number of manipulated meters that is promised.
+    powers : (p,)
+        Fault of the active power of each meter's customer.
     """
 
     laterals: Bools = field(repr=False)
     phases: Bools
     most: int
+    powers: Ints
 
 
-def neighbourhoods(modes: Modes, most: int) -> Neighbourhoods:
-    """Neighbourhoods of the members of some modes, with the promised number of manipulated ones."""
+def neighbourhoods(modes: Modes, most: int, customers: Ints | None = None) -> Neighbourhoods:
+    """Neighbourhoods of the members of some modes; customer of each (p,), None for the same order."""
     some = [each for each in clusters(modes) if each.size < modes.size]
     laterals = np.zeros((len(some), modes.size), dtype=np.bool_)
     for k, each in enumerate(some):
         laterals[k, each] = True
-    return Neighbourhoods(laterals, modes.phases > 0.0, most)
+    customers = np.arange(modes.size) if customers is None else customers
+    return Neighbourhoods(laterals, modes.phases > 0.0, most, modes.size + customers)
 
 
 def reflected(found: Identification, near: Neighbourhoods) -> Identification:

@@ -41,16 +41,17 @@ def explanation(given: SearchProblem, accused: Bools, *, power: bool = False) ->
     return Identification(chosen[None], np.zeros(1, np.intp), np.ones(1), accused, (given,))
 
 
-def contested(given: Identification, masked: Bools, most: int) -> Bools:
+def contested(given: Identification, masked: Bools, most: int, *, powers: bool = False) -> Bools:
     """Named meters that other explanations replace, (p,)."""
-    return given.named & ~collusion.weighed(given, masked, near(most)).found.named
+    return given.named & ~collusion.weighed(given, masked, near(most, powers=powers)).found.named
 
 
-def near(most: int) -> Neighbourhoods:
-    """The two laterals, halves of them, and one phase."""
+def near(most: int, *, powers: bool = False) -> Neighbourhoods:
+    """The two laterals, halves of them, and one phase; the one power, or a power of each meter's customer."""
     laterals = np.repeat(np.eye(4, dtype=np.bool_), 3, axis=1)
     whole = np.repeat(np.eye(2, dtype=np.bool_), 6, axis=1)
-    return Neighbourhoods(np.vstack([laterals, whole]), np.ones((METERS, 1), dtype=np.bool_), most)
+    own = METERS + np.arange(METERS) * powers
+    return Neighbourhoods(np.vstack([laterals, whole]), np.ones((METERS, 1), dtype=np.bool_), most, own)
 
 
 def some(*meters: int) -> Bools:
@@ -380,3 +381,27 @@ def test_no_bound_is_given_where_readings_are_too_few() -> None:
     given = street(np.zeros(METERS))
     few = replace(given, F=np.ones_like(given.F))
     assert collusion._Loose.of(few, np.append(NONE, False)) is None
+
+
+def customers(lie: Floats, powers: Floats, charge: float = 5.0) -> SearchProblem:
+    """Scores of false readings (p,) and powers (p,): power 1 moves as meter 4 and power 7 beside meter 1."""
+    V = NOISE * np.eye(METERS) + SHARED * np.kron(np.eye(2), np.ones((6, 6)))
+    effect = np.tril(np.ones((METERS, METERS))) / METERS
+    effect[:, 1] = np.eye(METERS)[4] + effect[:, 7] - np.eye(METERS)[1]
+    W = np.hstack([np.eye(METERS), effect])
+    F, y = W.T @ np.linalg.solve(V, W), W.T @ np.linalg.solve(V, W @ np.append(lie, powers))
+    bound = np.append(np.full(METERS, inf), np.full(METERS, 5.0))
+    return SearchProblem(y, F, np.ones(2 * METERS), METERS, np.repeat([0.0, charge], METERS), bound)
+
+
+def test_customers_with_false_powers_contest_an_honest_meter() -> None:
+    """Meter 1 and its power imitate meter 4 and power 7; no other meters do."""
+    given = customers(2.0 * some(1), 2.0 * some(1))
+    shown = Identification(
+        np.append(some(4), some(7))[None], np.zeros(1, np.intp), np.ones(1), some(4), (given,)
+    )
+    assert (contested(shown, NONE, 4, powers=True) == some(4)).all()
+    out = collusion.weighed(shown, NONE, near(4, powers=True)).found
+    assert (out.chosen[1] == np.append(some(1), some(1))).all()
+    # The customer's meter is masked already, and its power is free.
+    assert (contested(shown, some(1), 4, powers=True) == some(4)).all()

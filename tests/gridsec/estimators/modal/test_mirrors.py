@@ -96,7 +96,7 @@ def test_a_mirror_image_costs_as_much_as_its_set_where_readings_agree() -> None:
     given.F[:p, :p] = F
     laterals = np.zeros((1, p), dtype=np.bool_)
     laterals[0, 5:] = True
-    near = mirrors.Neighbourhoods(laterals, np.zeros((p, 1), dtype=np.bool_), p)
+    near = mirrors.Neighbourhoods(laterals, np.zeros((p, 1), dtype=np.bool_), p, p + np.arange(p))
     chosen = np.append(truth, False)
     images = list(mirrors._images(given, chosen, near))
     assert all(more > 0.0 for _, more in images)
@@ -190,6 +190,6 @@ def test_all_others_of_a_lateral_have_an_image_within_the_promise(most: int) -> 
     """Meter 4 of the meters 4 to 7, which belong to two branches; the others are one lateral."""
     given = problem(3, p=8, others=1)
     laterals = (np.arange(8) < 4)[None]
-    near = mirrors.Neighbourhoods(laterals, np.zeros((8, 1), dtype=np.bool_), most)
+    near = mirrors.Neighbourhoods(laterals, np.zeros((8, 1), dtype=np.bool_), most, 8 + np.arange(8))
     images = [np.flatnonzero(one).tolist() for one, _ in mirrors._images(given, np.arange(9) == 4, near)]
     assert images == ([[5, 6, 7]] if most == 3 else [])
