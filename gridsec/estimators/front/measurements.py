@@ -64,8 +64,9 @@ def impossible(design: FrontDesign, frame: Frame, named: Bools) -> tuple[Bools, 
     no load and no outage causes it. One below them may be an outage of one customer, and is judged as others.
     """
     low, high = design.options.v2_limits
-    above = frame.seen & np.isfinite(frame.y) & (frame.y > high)
-    out = above | (frame.seen & np.isfinite(frame.y) & (frame.y < low))
+    read = frame.seen & np.isfinite(frame.y)
+    above = read & (frame.y > high)
+    out = above | (read & (frame.y < low))
     if not any_of(out):
         return above, frame
     if np.count_nonzero(out | named) > design.most_among(int(np.count_nonzero(frame.seen & ~out))):

@@ -37,11 +37,10 @@ which is convex (`alike.bounded_minimum`). With any amounts of the sign, and ind
 is a minimum over z >= 0 of all usable meters, ``z' F z / 2 - z' y``, a bound. Where that is above the limit
 of a naming, the meters with the largest z are the only g. Elsewhere the relaxation's solution orders the
 meters, and the best beginning of this order is improved by single meters and by exchanges, and so are the
-best of the laterals and of such sets of earlier searches. x is first the
-mean amount of C, then that of the set found. Where that gains nothing and the solution has more meters than
-the promise, x is larger. Where the best g has meters of C, the best one without them is also found. g is also
-looked for in place of the rest's meters of its own sign, since colluding meters may share one amount, and of
-its faults that are no meters.
+best of the laterals and of such sets of earlier searches. x is first the mean amount of C, then that of the
+set found. Where that gains nothing and the solution has more meters than the promise, x is larger. Where the
+best g has meters of C, the best one without them is also found. g is also looked for in place of the rest's
+meters of its own sign, since colluding meters may share one amount, and of its faults that are no meters.
 
 Before all that, one bound of L excludes most C (`_Loose`): any amounts of all other meters, and amounts of
 the reverse sign of C. It takes one inverse of F for all C, and a problem of the size of C each.

@@ -110,8 +110,8 @@ def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iter
                 )
                 more = float(both[1] - both[0] + problem.charge[image].sum() - problem.charge[chosen].sum())
             yield image, max(more, 0.0) + _apart(likelihood, chosen & image, column)
-    # What lies outside of a lateral is one, too, within the promise. A majority beside the busbar's meter is
-    # no image: the level of all meters is unknown there.
+    # The meters outside of a lateral are a neighbourhood within the promise. A majority beside the busbar's
+    # meter is no image: the level of all meters is unknown there.
     inside, outside = near.laterals & read, ~near.laterals & read
     few, others = (np.count_nonzero(each ^ chosen[:p], axis=1) <= near.most for each in (inside, outside))
     busbar = np.count_nonzero(chosen[-b:])

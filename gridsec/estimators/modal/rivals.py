@@ -45,7 +45,7 @@ from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal import full as exact
 from gridsec.estimators.modal.filter import FilterState, Interval, Update
 from gridsec.estimators.modal.model import REPORTED_S, Modes
-from gridsec.estimators.modal.replay import History, Suspected
+from gridsec.estimators.modal.replay import History, Reading, Suspected
 from gridsec.estimators.modal.signatures import Joint, Onsets, Scored
 from gridsec.estimators.modal.static import Static
 
@@ -265,22 +265,13 @@ def transitions(modes: Modes, history: History, age: int, *, ramp: bool = False)
     return tuple(out)
 
 
-def followed(  # noqa: PLR0917  # the states, and one tick
-    before: Sequence[Rival],
-    t: float,
-    m: Floats,
-    seen: Bools | None,
-    unknown: Floats | None = None,
-    jump: float = 0.0,
-    *,
-    begun: bool = False,
-) -> list[Rival]:
+def followed(before: Sequence[Rival], *tick: *Reading, begun: bool = False) -> list[Rival]:
     """Take in the residuals of one tick under some models; as `follow`.
 
     A rival without unrest has the states of the model until its first jump. Such steps are made once.
     """
     done: _Done = {}
-    return [follow(each, t, m, seen, unknown, jump, begun=begun, done=done) for each in before]
+    return [follow(each, *tick, begun=begun, done=done) for each in before]
 
 
 _Done = dict[tuple[int, ...], tuple[Any, ...]]

@@ -444,16 +444,22 @@ class Scored:
         return Scored(self.score - y @ F, self.information - F.T @ F), gain
 
 
-def scored(modes: Modes, onsets: Onsets, static: Static, row: int) -> Scored:
-    """Scores and information at the members of one row; as `joint`."""
-    score, U, own = onsets.score[row], modes.U, onsets.information[row]
+def _in_modes(modes: Modes, onsets: Onsets, static: Static, row: int) -> InModes:
+    """Scores and information of one row in the modes, all directions integrated out."""
+    score, own = onsets.score[row], onsets.information[row]
     side, cov = np.zeros((own.size, 0)), np.zeros((0, 0))
     if modes.sign.size:
         score = score - onsets.cross[row] * static.constant
         side, cov = onsets.cross[row][:, None] * modes.directions, current(modes, static).cov
-    of_members = U @ side
-    information = (U * own) @ U.T - of_members @ cov @ of_members.T
-    return Scored(U @ score, information, InModes(U, score, own, side, cov))
+    return InModes(modes.U, score, own, side, cov)
+
+
+def scored(modes: Modes, onsets: Onsets, static: Static, row: int) -> Scored:
+    """Scores and information at the members of one row; as `joint`."""
+    now, U = _in_modes(modes, onsets, static, row), modes.U
+    of_members = U @ now.side
+    information = (U * now.own) @ U.T - of_members @ now.cov @ of_members.T
+    return Scored(U @ now.score, information, now)
 
 
 def joint(modes: Modes, onsets: Onsets, static: Static, row: int) -> Joint:
@@ -466,17 +472,13 @@ def joint(modes: Modes, onsets: Onsets, static: Static, row: int) -> Joint:
     row
         The row.
     """
-    score, g, level = onsets.score[row], onsets.signature[:, row], float(onsets.level[row])
-    information, shift = np.diag(onsets.information[row]), np.stack([np.diag(each) for each in g])
+    now = _in_modes(modes, onsets, static, row)
+    turn, shift = now.cov @ now.side.T, np.stack([np.diag(each) for each in onsets.signature[:, row]])
     if modes.sign.size:
-        score = score - onsets.cross[row] * static.constant
-        side = onsets.cross[row][:, None] * modes.directions
-        turn = current(modes, static).cov @ side.T
-        information -= side @ turn
         g_w, g_b = static.signature[:, :, None] * modes.directions
         shift[0] -= g_w @ turn
         shift[1] += (modes.directions - g_b) @ turn
-    return Joint(score, information, shift, level)
+    return Joint(now.score, np.diag(now.own) - now.side @ turn, shift, float(onsets.level[row]))
 
 
 @dataclass(frozen=True, eq=False)
