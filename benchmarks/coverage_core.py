@@ -108,10 +108,11 @@ class Watch:
         streak = np.where(found.found.chosen[0, : named.size], self.streak + 1, 0)
         self.phases = self.phases + 1 if verdict.certain_phases(self.kernel, found).any() else 0
         age = int(self.state.detector.onsets.age[found.row])
-        self.suspicion, self.streak = found, streak
+        before, self.suspicion, self.streak = self.suspicion, found, streak
         self.due = tick + (1 if (streak[named] == 1).any() or self.phases == 1 else max(1, age // LOOKS))
         since = () if self.state.masked.meters.any() else self.state.history.readings[-age:]
-        sure = confirmed(found.found, named, streak, since)
+        earlier = before.found if before is not None and before.row == found.row else None
+        sure = confirmed(found.found, earlier, named, streak, since)
         if sure.any():
             final = replace(found, found=replace(found.found, named=sure))
             self.state, _ = core.mask(self.kernel, self.state, final)

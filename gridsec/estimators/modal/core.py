@@ -619,7 +619,7 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     if best:
         found = _searched(core, state, _problem(core, scored[rows[best]], unknown), known)
     age = int(test.onsets.age[rows[best]])
-    found = mirrors.reflected(found, core.near)
+    found = mirrors.reflected(found, core.near, state.masked.meters)
     replacing = () if before is None else before.replacing
     weighed = collusion.weighed(found, state.masked.meters, core.near, _left(state, found, age), replacing)
     sets = {each.tobytes(): each for each in (*weighed.replacing, *replacing)}

@@ -347,7 +347,9 @@ class Tableau:
         self.columns[:q, :r] = self.rows.T
         self.order = np.zeros(0, dtype=np.intp)
         self.chosen = np.zeros(q, dtype=np.bool_)
+        # Meters without a reading explain nothing.
         self.barred = np.zeros(q, dtype=np.bool_)
+        self.barred[: problem.meters] = ~informed(problem)
         # Number of chosen meters.
         self.cost, self.count = 0.0, 0
         self.size = 2.0 * np.log(problem.std)

@@ -16,9 +16,9 @@ believed only as far as others confirm it. Beside the busbar's meter J' has at m
 
 **Phases.** A phase of the busbar off by x, with meters A of the phase off by -x, has the same residuals as
 the other meters of the phase off by -x: L is the same. The promise "at most M manipulated meters" excludes
-images with more meters where J keeps it, the busbar's meter included. From meters to the busbar's meter with
-others, J' has its own penalty, if that is larger: one meter that is off is no reason to doubt all others of
-its phase.
+images with more meters where J keeps it, the busbar's meter included. Masked meters count in both numbers.
+From meters to the busbar's meter with others, J' has its own penalty, if that is larger: one meter that is
+off is no reason to doubt all others of its phase.
 """
 
 from __future__ import annotations
@@ -82,26 +82,38 @@ def neighbourhoods(modes: Modes, most: int, customers: Ints | None = None) -> Ne
     return Neighbourhoods(laterals, modes.phases > 0.0, most, modes.size + customers)
 
 
-def reflected(found: Identification, near: Neighbourhoods) -> Identification:
-    """Explanations with the mirror images of those that weigh at least `REFLECTED`."""
+def reflected(found: Identification, near: Neighbourhoods, masked: Bools) -> Identification:
+    """Explanations with the mirror images of those that weigh at least `REFLECTED`.
+
+    Parameters
+    ----------
+    found
+        The explanations.
+    near
+        Neighbourhoods, and the largest number of manipulated meters that is promised.
+    masked : (p,)
+        Masked meters: they count in that number.
+    """
     found_by, likelier = costs_of(found), False
     for k in np.flatnonzero(found.weight >= REFLECTED).tolist():
         cost = found_by[int(found.model[k])]
         own = cost[found.chosen[k].tobytes()]
-        for image, more in _images(found.problems[int(found.model[k])], found.chosen[k], near):
+        for image, more in _images(found.problems[int(found.model[k])], found.chosen[k], near, masked):
             key = image.tobytes()
             if own + more < cost.get(key, np.inf):
                 cost[key], likelier = own + more, True
     return identified(found.problems, found_by, found.plain) if likelier else found
 
 
-def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iterator[tuple[Bools, float]]:
+def _images(
+    problem: SearchProblem, chosen: Bools, near: Neighbourhoods, masked: Bools
+) -> Iterator[tuple[Bools, float]]:
     """Mirror images of a set, (q,), and their costs beyond its own."""
     p, b = near.phases.shape
     read = informed(problem)
     likelihood = _Likelihood(problem, chosen)
     for phase in range(b):
-        image, column = _of_phase(chosen, near, phase, read)
+        image, column = _of_phase(chosen, near, phase, read, masked)
         if image is not None:
             more = 0.0
             if not chosen[phase - b]:
@@ -113,9 +125,11 @@ def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iter
     # The meters outside of a lateral are a neighbourhood within the promise. A majority beside the busbar's
     # meter is no image: the level of all meters is unknown there.
     inside, outside = near.laterals & read, ~near.laterals & read
-    few, others = (np.count_nonzero(each ^ chosen[:p], axis=1) <= near.most for each in (inside, outside))
+    few, others = (
+        np.count_nonzero((each ^ chosen[:p]) | masked, axis=1) <= near.most for each in (inside, outside)
+    )
     busbar = np.count_nonzero(chosen[-b:])
-    kept = np.count_nonzero(chosen[:p]) + busbar <= near.most
+    kept = _manipulated(chosen, masked, b) <= near.most
     laterals = np.vstack([inside[few | (busbar == 0)], outside[kept & others]])
     sets = np.unique(np.hstack([laterals & ~chosen[:p], laterals & chosen[:p]]), axis=0)
     sets = sets[sets[:, :p].any(axis=1) & sets[:, p:].any(axis=1)]
@@ -134,7 +148,9 @@ def _images(problem: SearchProblem, chosen: Bools, near: Neighbourhoods) -> Iter
         yield from zip(images, more_of.tolist(), strict=True)
 
 
-def _of_phase(chosen: Bools, near: Neighbourhoods, phase: int, read: Bools) -> tuple[Bools | None, Bools]:
+def _of_phase(
+    chosen: Bools, near: Neighbourhoods, phase: int, read: Bools, masked: Bools
+) -> tuple[Bools | None, Bools]:
     """Mirror image by one phase of the busbar, None for none, and the meters that are off in both, (p,)."""
     p, b = near.phases.shape
     of_phase, at = near.phases[:, phase] & read, chosen.size - b + phase
@@ -142,11 +158,22 @@ def _of_phase(chosen: Bools, near: Neighbourhoods, phase: int, read: Bools) -> t
     image = chosen.copy()
     image[:p] = (chosen[:p] & ~of_phase) | others
     image[at] = not chosen[at]
-    own = int(np.count_nonzero(chosen[:p]) + np.count_nonzero(chosen[-b:]))
-    if own <= near.most < np.count_nonzero(image[:p]):
+    own = _manipulated(chosen, masked, b)
+    if own <= near.most < np.count_nonzero(image[:p] | masked):
         return None, accused
     column = others if chosen[at] else accused
     return (image if any_of(column) else None), column
+
+
+def _manipulated(chosen: Bools, masked: Bools, phases: int) -> int:
+    """Number of manipulated meters that counts in the promise: with masked meters, or with the busbar's."""
+    own = chosen[: masked.size]
+    return int(
+        max(
+            np.count_nonzero(own | masked),
+            np.count_nonzero(own) + np.count_nonzero(chosen[chosen.size - phases :]),
+        )
+    )
 
 
 def _apart(likelihood: _Likelihood, rest: Bools, column: Bools) -> float:

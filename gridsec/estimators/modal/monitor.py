@@ -369,11 +369,11 @@ def _identified(
         return _unsuspected(state), evidence
     if tick < state.due or not core.alarmed(kernel, evidence):
         return replace(state, suspicion=suspicion), evidence
-    now, suspicion = _searched(kernel, state.core, evidence, suspicion)
-    over = core.passed(kernel, now, suspicion)
+    now, found = _searched(kernel, state.core, evidence, suspicion)
+    over = core.passed(kernel, now, found)
     if over is not None:
         return _unsuspected(replace(state, core=over[0])), over[1]
-    return _named(design, replace(state, core=now, suspicion=suspicion), suspicion, evidence, uses_q)
+    return _named(design, replace(state, core=now, suspicion=suspicion), found, evidence, uses_q)
 
 
 def _named(
@@ -391,9 +391,11 @@ def _named(
     # A fault with a first naming is searched again at the next tick.
     first = any((each == 1).any() for each in (streak[named], phases, inverters))
     wait = 1 if first else max(1, age // LOOKS)
-    after = replace(state, streak=streak, phases=phases, inverters=inverters, due=tick + wait)
+    due, before = tick + wait, state.suspicion
+    after = replace(state, suspicion=suspicion, streak=streak, phases=phases, inverters=inverters, due=due)
+    earlier = before.found if before is not None and before.row == suspicion.row else None
     since = () if any_of(masked) else state.core.history.readings[-age:]
-    sure = final(suspicion.found, named, streak, since, kernel.near.laterals)
+    sure = final(suspicion.found, earlier, named, streak, since, kernel.near.laterals)
     if suspicion.fits and not any_of(sure):
         # Masked meters alone may have been manipulated before they were masked.
         sure = alone(suspicion.found, masked)

@@ -1,11 +1,13 @@
 """Final names: meters that searches in turn accuse, masked together or where nothing depends on it.
 
-    final(found, named, streak, since, laterals) -> (p,)      meters to mask
+    final(found, before, named, streak, since, laterals) -> (p,)      meters to mask
     unseen(design, effect, most, lead, off) -> bool           steps by other clocks may explain them
 
 A search names the meters without which nothing explains the readings. The first explanation of several faults
 may be a part of them: names need searches in turn, `confirmed`. A sole fault is named by one search, and two
 readings: a step of the busbar is in one reading a tick early or late by clocks that differ by half a tick.
+With the next reading the amount of such a fault halves. Its name waits for as many searches as those of
+several faults.
 
 **Parts of an explanation.** Masked meters have any amounts. With N the meters to mask, of the scores y and
 the information F of the others remain
@@ -38,6 +40,8 @@ TAP = 0.05
 """Largest step of a tap changer, squared pu: 2.5 % of the voltage."""
 CONFIRM = 2
 """Readings of a sole fault before it is named, and searches in turn that accuse one of several."""
+LASTS = 0.75
+"""Least ratio of the amount of a sole fault to that of the search before, 1: one false reading has a half."""
 SEVERAL = 4
 """Searches in turn before a meter is named beside others that are not confirmed yet."""
 WHOLE = 4 * SEVERAL
@@ -50,31 +54,44 @@ FLAT = 1e-6
 """Prior information of the amounts of masked meters, in that of the prior, 1: rounding."""
 
 
-def final(
-    found: Identification, named: Bools, streak: Ints, since: Sequence[Reading], laterals: Bools
+def final(  # noqa: PLR0917  # two searches, and the counts of both
+    found: Identification,
+    before: Identification | None,
+    named: Bools,
+    streak: Ints,
+    since: Sequence[Reading],
+    laterals: Bools,
 ) -> Bools:
     """Meters to mask now, (p,).
 
     Parameters
     ----------
-    found, named, streak, since
+    found, before, named, streak, since
         As in `confirmed`.
     laterals : (G, p)
         Members of the laterals that may be manipulated as a whole.
     """
-    sure = confirmed(found, named, streak, since)
+    sure = confirmed(found, before, named, streak, since)
     if not any_of(sure) or streak[sure].max() >= WHOLE or separable(found, sure, laterals):
         return sure
     return np.zeros_like(sure)
 
 
-def confirmed(found: Identification, named: Bools, streak: Ints, since: Sequence[Reading]) -> Bools:
+def confirmed(
+    found: Identification,
+    before: Identification | None,
+    named: Bools,
+    streak: Ints,
+    since: Sequence[Reading],
+) -> Bools:
     """Meters that a search names finally, (p,).
 
     Parameters
     ----------
     found
         What it found.
+    before
+        What the search before it found at the same onset; None before the first.
     named : (p,)
         Meters that it names newly.
     streak : (p,)
@@ -82,13 +99,25 @@ def confirmed(found: Identification, named: Bools, streak: Ints, since: Sequence
     since
         Ticks since the suspected onset; none where meters are masked, and may collude with others.
     """
-    if any_of(named) and np.count_nonzero(found.chosen[0]) == 1:
+    sole = any_of(named) and np.count_nonzero(found.chosen[0]) == 1
+    passing = sole and before is not None and _shrinks(found, before)
+    if sole and not passing:
         readings = sum(seen is None or all_of(seen[named]) for _, _, seen, *_ in since)
         if readings >= CONFIRM:
             return named
     # Without a part of the meters, other faults may explain the rest: a few more searches may name all.
-    least = CONFIRM if all_of(streak[named] >= CONFIRM) else SEVERAL
+    least = CONFIRM if all_of(streak[named] >= CONFIRM) and not passing else SEVERAL
     return np.asarray(named & (streak >= least))
+
+
+def _shrinks(found: Identification, before: Identification) -> bool:
+    """The amount ``y / F`` of the sole fault of the likeliest set is less than `LASTS` of that before."""
+    model, at = int(found.model[0]), int(np.flatnonzero(found.chosen[0])[0])
+    if model >= len(before.problems):
+        # A transition is a model of the last search only.
+        return False
+    now, then = (each.problems[model].y[at] / each.problems[model].F[at, at] for each in (found, before))
+    return bool(now / then < LASTS)
 
 
 def alone(found: Identification, masked: Bools) -> Bools:

@@ -220,8 +220,9 @@ def search(
     known : (k, q)
         More sets that count, as those of an earlier search, which descents may miss; None: none.
     """
-    batches = together(groups)
     read = informed(problem)
+    groups = tuple(each[read[each]] for each in groups) if not read.all() else groups
+    batches = together(groups)
     whole = np.zeros((0, problem.meters)) if laterals is None else (laterals & read).astype(np.float64)
     start, nothing = relevant(problem), np.zeros(problem.y.size, dtype=np.bool_)
     ends, one_amount, least = list[Tableau](), list[Bools](), list[float]()
@@ -416,6 +417,8 @@ def _recalled(problem: SearchProblem, found: dict[bytes, float], known: Bools) -
     suits them. Sets with impossible amounts do not count.
     """
     out, least = problem, min(found.values())
+    known = known.copy()
+    known[:, : problem.meters] &= informed(problem)
     for chosen, shared in zip(known, mixed(problem, known), strict=True):
         own = _sized(problem, chosen)
         if chosen.any() and (np.abs(mean_amounts(own, chosen)) > own.bound[chosen]).any():

@@ -91,7 +91,8 @@ def largest(seed: int, how: Callable[[Snapshot, Bools], Snapshot]) -> Floats:
         told = how(said, withhold & (age >= WITHHELD_S))
         state, _, _ = watcher().step(state, to_frame(site(), told))
     lie = stealthy(watcher().design, state, np.flatnonzero(withhold))
-    assert np.abs(lie).max() > 1e-3
+    # More than a tenth of the accuracy class.
+    assert np.abs(lie).max() > 5e-4
     return lie
 
 

@@ -17,6 +17,8 @@ from tests.gridsec.estimators.modal.test_search import problem
 
 FEEDER = tree(12, np.random.default_rng(3))
 MODEL = model_of(FEEDER)
+NONE = np.zeros(12, dtype=np.bool_)
+"""No masked meter."""
 POWERS = np.vstack([np.zeros((1, 12)), power_columns(FEEDER)[:, :12]])
 
 
@@ -98,7 +100,7 @@ def test_a_mirror_image_costs_as_much_as_its_set_where_readings_agree() -> None:
     laterals[0, 5:] = True
     near = mirrors.Neighbourhoods(laterals, np.zeros((p, 1), dtype=np.bool_), p, p + np.arange(p))
     chosen = np.append(truth, False)
-    images = list(mirrors._images(given, chosen, near))
+    images = list(mirrors._images(given, chosen, near, NONE[: near.phases.shape[0]]))
     assert all(more > 0.0 for _, more in images)
 
 
@@ -167,7 +169,7 @@ def test_explanations_without_mirror_images_stay() -> None:
     chosen = np.zeros((1, given.chosen.shape[1]), dtype=np.bool_)
     chosen[0, 14] = True
     alone = replace(given, chosen=chosen, model=np.zeros(1, dtype=np.intp), weight=np.ones(1))
-    assert mirrors.reflected(alone, of.near) is alone
+    assert mirrors.reflected(alone, of.near, NONE) is alone
 
 
 def test_a_mirror_image_that_was_found_with_its_own_penalty_has_that_of_its_set() -> None:
@@ -180,16 +182,30 @@ def test_a_mirror_image_that_was_found_with_its_own_penalty_has_that_of_its_set(
     alone = identified(given.problems, ({busbar.tobytes(): 0.0}, *({} for _ in given.problems[1:])))
     both = identified(given.problems, (sets, *({} for _ in given.problems[1:])))
     for each in (alone, both):
-        found = mirrors.reflected(each, of.near)
+        found = mirrors.reflected(each, of.near, NONE)
         assert np.isclose(found.weight[(found.chosen == meters).all(axis=1)].sum(), found.weight[0])
         assert not found.certain[-1]
 
 
-@pytest.mark.parametrize("most", [2, 3])
-def test_all_others_of_a_lateral_have_an_image_within_the_promise(most: int) -> None:
+@pytest.mark.parametrize(("most", "masked"), [(2, 0), (3, 0), (3, 1), (4, 1)])
+def test_all_others_of_a_lateral_have_an_image_within_the_promise(most: int, masked: int) -> None:
     """Meter 4 of the meters 4 to 7, which belong to two branches; the others are one lateral."""
     given = problem(3, p=8, others=1)
     laterals = (np.arange(8) < 4)[None]
     near = mirrors.Neighbourhoods(laterals, np.zeros((8, 1), dtype=np.bool_), most, 8 + np.arange(8))
-    images = [np.flatnonzero(one).tolist() for one, _ in mirrors._images(given, np.arange(9) == 4, near)]
-    assert images == ([[5, 6, 7]] if most == 3 else [])
+    found = mirrors._images(given, np.arange(9) == 4, near, np.arange(8) < masked)
+    images = [np.flatnonzero(one).tolist() for one, _ in found]
+    assert images == ([[5, 6, 7]] if most - masked == 3 else [])
+
+
+@pytest.mark.parametrize("masked", [0, 1])
+def test_masked_meters_count_in_the_promise_of_images_by_a_phase(masked: int) -> None:
+    """Three of seven meters of the phase, or the other four with its meter; meter 7 is on another phase."""
+    of_phase = np.arange(8) < 7
+    near = mirrors.Neighbourhoods(np.zeros((0, 8), dtype=np.bool_), of_phase[:, None], 4, 8 + np.arange(8))
+    image, _ = mirrors._of_phase(np.arange(9) < 3, near, 0, of_phase, np.arange(8) >= 8 - masked)
+    if masked:
+        assert image is None
+    else:
+        assert image is not None
+        assert np.flatnonzero(image).tolist() == [3, 4, 5, 6, 8]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from gridsec.arrays import Bools
+from gridsec.estimators.modal.costs import SearchProblem
 from gridsec.estimators.modal.monitor import design, init, own_errors, step
 from gridsec.estimators.modal.naming import CONFIRM, SEVERAL, confirmed
 from gridsec.estimators.modal.replay import Reading
@@ -38,7 +39,7 @@ NONE = np.zeros(P, dtype=np.intp)
 
 
 def test_a_sole_fault_with_two_readings_is_named_by_one_search() -> None:
-    assert confirmed(found(2), mask(2), NONE + mask(2), ticks(None, None)).tolist() == mask(2).tolist()
+    assert confirmed(found(2), None, mask(2), NONE + mask(2), ticks(None, None)).tolist() == mask(2).tolist()
 
 
 @pytest.mark.parametrize(
@@ -47,35 +48,53 @@ def test_a_sole_fault_with_two_readings_is_named_by_one_search() -> None:
     ids=["one tick", "after a gap", "silent"],
 )
 def test_one_reading_of_the_meter_is_not_enough(since: list[Reading]) -> None:
-    assert not confirmed(found(2), mask(2), NONE + mask(2), since).any()
+    assert not confirmed(found(2), None, mask(2), NONE + mask(2), since).any()
+
+
+@pytest.mark.parametrize(("amount", "passes"), [(0.5, True), (1.0, False), (-0.2, True)])
+def test_a_sole_fault_of_which_the_amount_halves_waits(amount: float, passes: bool) -> None:
+    """As that of one false reading does with the next one; with unequal information of both searches."""
+
+    def problem(x: float, F: float) -> SearchProblem:
+        y = F * x * mask(2, size=P + 2)
+        return SearchProblem(y, F * np.eye(P + 2), np.ones(P + 2), P, np.zeros(P + 2), np.full(P + 2, np.inf))
+
+    before, now = replace(found(2), problems=(problem(1.0, 9.0),)), found(2)
+    now = replace(now, problems=(problem(amount, 7.0),))
+    since = ticks(None, None)
+    assert confirmed(now, before, mask(2), CONFIRM * mask(2), since).any() != passes
+    assert confirmed(now, before, mask(2), SEVERAL * mask(2), since).tolist() == mask(2).tolist()
+    # A transition is no model of the search before.
+    other = replace(now, model=np.ones(1, np.intp), problems=(*now.problems, problem(amount, 7.0)))
+    assert confirmed(other, before, mask(2), CONFIRM * mask(2), since).tolist() == mask(2).tolist()
 
 
 @pytest.mark.parametrize("faults", [(1, 2), (2, 5), (2, 6)], ids=["meter", "power", "busbar"])
 def test_a_part_of_several_faults_needs_searches_in_turn(faults: tuple[int, ...]) -> None:
     several, since = found(*faults), ticks(None, None, None)
     named = replace(several, named=mask(2)).named
-    assert not confirmed(several, named, NONE + named, since).any()
-    assert confirmed(several, named, CONFIRM * named, since).tolist() == named.tolist()
+    assert not confirmed(several, None, named, NONE + named, since).any()
+    assert confirmed(several, None, named, CONFIRM * named, since).tolist() == named.tolist()
 
 
 def test_meters_that_are_named_by_turns_of_different_length_are_apart() -> None:
     """An explanation is named whole; after `SEVERAL` searches in turn a meter is named by itself."""
     streak, since = CONFIRM * mask(1) + mask(3), ticks(None, None)
-    assert confirmed(found(1, 3), mask(1, 3), streak + mask(3), since).tolist() == mask(1, 3).tolist()
-    assert not confirmed(found(1, 3), mask(1, 3), streak, since).any()
+    assert confirmed(found(1, 3), None, mask(1, 3), streak + mask(3), since).tolist() == mask(1, 3).tolist()
+    assert not confirmed(found(1, 3), None, mask(1, 3), streak, since).any()
     later = streak + (SEVERAL - CONFIRM) * mask(1)
-    assert confirmed(found(1, 3), mask(1, 3), later, since).tolist() == mask(1).tolist()
+    assert confirmed(found(1, 3), None, mask(1, 3), later, since).tolist() == mask(1).tolist()
 
 
 def test_a_meter_that_is_accused_but_not_named_is_not_final() -> None:
     """Searches in turn count for the likeliest explanation; the last one has to name the meter."""
     streak = CONFIRM * mask(1, 3)
-    assert confirmed(found(1, 3), mask(3), streak, ticks(None, None)).tolist() == mask(3).tolist()
+    assert confirmed(found(1, 3), None, mask(3), streak, ticks(None, None)).tolist() == mask(3).tolist()
 
 
 def test_masked_meters_leave_no_fault_alone() -> None:
     """Without the ticks since the onset, a sole fault needs searches in turn."""
-    assert not confirmed(found(2), mask(2), NONE + mask(2), []).any()
+    assert not confirmed(found(2), None, mask(2), NONE + mask(2), []).any()
 
 
 def test_errors_of_registers_follow_the_voltage() -> None:

@@ -68,9 +68,9 @@ def test_a_part_is_not_masked_where_a_power_then_explains_the_rest() -> None:
     assert not naming.separable(found, mask(0, 1), NO_LATERALS)
     assert naming.separable(found, mask(*range(8)), NO_LATERALS)
     streak = np.full(8, naming.SEVERAL)
-    assert not naming.final(found, mask(0, 1), streak, (), NO_LATERALS).any()
+    assert not naming.final(found, None, mask(0, 1), streak, (), NO_LATERALS).any()
     later = np.full(8, naming.WHOLE)
-    assert naming.final(found, mask(0, 1), later, (), NO_LATERALS).tolist() == mask(0, 1).tolist()
+    assert naming.final(found, None, mask(0, 1), later, (), NO_LATERALS).tolist() == mask(0, 1).tolist()
 
 
 def test_a_part_is_masked_where_the_rest_stays_likely() -> None:
@@ -80,7 +80,8 @@ def test_a_part_is_masked_where_the_rest_stays_likely() -> None:
     found = two(given, mask(2, 6, size=10), mask(2, size=10), 1e-4)
     assert naming.separable(found, mask(2), NO_LATERALS)
     assert (
-        naming.final(found, mask(2), np.full(8, naming.SEVERAL), (), NO_LATERALS).tolist() == mask(2).tolist()
+        naming.final(found, None, mask(2), np.full(8, naming.SEVERAL), (), NO_LATERALS).tolist()
+        == mask(2).tolist()
     )
 
 
