@@ -105,7 +105,7 @@ class Watch:
             return
         found = core.identify(self.kernel, self.state, evidence)
         named = found.found.named & ~self.state.masked.meters
-        streak = np.where(found.found.chosen[0, : named.size], self.streak + 1, 0)
+        streak = np.where(named, self.streak + 1, 0)
         self.phases = self.phases + 1 if verdict.certain_phases(self.kernel, found).any() else 0
         age = int(self.state.detector.onsets.age[found.row])
         before, self.suspicion, self.streak = self.suspicion, found, streak

@@ -16,8 +16,14 @@ explanation.
 
 Steps and ramps describe a drift of unknown onset and shape to a share of its evidence only, `MISFIT`. Where
 they describe it better, J leaves less of the misfit of the readings, chance included. The promise limits g:
-(J - C) + g and the masked meters are at most M or a third, whichever is larger. An explanation of more meters
-names none.
+(J - C) + g and the masked meters are at most M or a third, whichever is larger. J is the likeliest set
+of that number. Where none weighs `DOUBT`, none names a meter.
+
+**Amounts of any size.** An adversary chooses the amounts, too. A set g of at most `MORE` meters for each
+fault of J, the masked ones included, has the fit ``E = y_g' (F_gg + V^-1)^-1 y_g`` with wide priors V. It
+contests the faults of C that it lacks where ``E(J) - E(g)`` is below the limit of above, and each of them
+gains less than `_LEAST` beside g. Such sets are ends of descents by the fit, from the rest without C and from
+all of J, these also without one meter, and the sets of earlier searches.
 
 **Decoys.** A meter of C that no g replaces must not protect the others. Where no g keeps a name, the lateral
 with the most of C, but not all, splits it. Both parts are checked by themselves, and split again up to
@@ -48,7 +54,7 @@ the reverse sign of C. It takes one inverse of F for all C, and a problem of the
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from math import inf, log
@@ -69,7 +75,7 @@ from gridsec.estimators.modal.costs import (
 )
 from gridsec.estimators.modal.laterals import GAIN, OneAmount
 from gridsec.estimators.modal.mirrors import Neighbourhoods
-from gridsec.estimators.modal.search import DOUBT, Identification, costs_of, identified, mixed
+from gridsec.estimators.modal.search import DOUBT, Identification, costs_of, descend, identified, mixed
 
 MISFIT = 0.1
 """Largest share of an explanation's evidence that steps and ramps leave open, 1."""
@@ -87,6 +93,14 @@ OPEN = 2.0
 """Share that a true set leaves open, in that of the set that suits the readings best, 1."""
 STARTS = 4
 """Sets of earlier searches and laterals that are improved besides those of the relaxation, 1."""
+WIDE = 0.03
+"""Least prior standard deviation of amounts of any size, squared pu: 1.5 % of the voltage."""
+MORE = 2
+"""Meters with amounts of any size for each fault of J, 1: where far more are needed, their number decides."""
+PARAMETER = 2.0
+"""Cost of one amount in a descent by the fit, 1: twice the gain by chance (Akaike's criterion)."""
+_BEYOND = 1e9
+"""Penalty of a meter beyond the promise, 1: above every misfit."""
 ALIKE_LESS = 3.0
 """Amount by which L with amounts alike may be below the bound of independent ones, 1: 2 log 2, and more."""
 
@@ -132,17 +146,19 @@ def weighed(
     known : (q,) each
         Such sets of earlier searches.
     """
-    p, J = found.named.size, found.chosen[0]
-    first = J.size - near.phases.shape[1]
-    named = np.zeros_like(J)
+    p, one = found.named.size, found.chosen[0]
+    first = one.size - near.phases.shape[1]
+    named = np.zeros_like(one)
     named[:p] = found.named & ~masked
     named[first:] = found.certain[first:]
-    if not any_of(named) or (np.count_nonzero(J) == 1 and not any_of(masked)):
-        return Weighed(found, np.zeros_like(J))
+    if not any_of(named) or (np.count_nonzero(one) == 1 and not any_of(masked)):
+        return Weighed(found, np.zeros_like(one))
     most = max(near.most, p // 3)
-    if np.count_nonzero(J[:p] | masked) > most:
+    kept = np.count_nonzero(found.chosen[:, :p] | masked, axis=1) <= most
+    likely = np.flatnonzero(kept & (found.weight >= DOUBT))
+    if not likely.size:
         return Weighed(replace(found, named=found.named & masked), named)
-    model = int(found.model[0])
+    J, model = found.chosen[likely[0]], int(found.model[likely[0]])
     problem, amount = found.problems[model], np.zeros(J.size)
     amount[J] = mean_amounts(problem, J)
     by_model, contested, replacing = costs_of(found), np.zeros_like(J), list[Bools]()
@@ -153,30 +169,50 @@ def weighed(
     sets += [np.arange(J.size) == k for k in np.flatnonzero(J[first:]) + first]
     whole, loose = float(_evidence(problem, J[None])[0]), _Loose.of(problem, J)
     begun = np.vstack([near.laterals, *(each[:p] for each in known)])
+    unread = np.append(~informed(problem), np.zeros(J.size - p, dtype=np.bool_))
     every = _Case(
-        problem, J, amount, J, masked, most, near.powers, begun, min(MISFIT, OPEN * left), whole, loose
+        problem,
+        J,
+        amount,
+        J,
+        masked,
+        most,
+        near.powers,
+        begun,
+        tuple(each & ~unread for each in known),
+        min(MISFIT, OPEN * left),
+        whole,
+        _fit(problem, J),
+        loose,
     )
-    cases = [(replace(every, accused=each), SPLITS) for each in sets]
-    while cases:
-        case, splits = cases.pop()
-        accused = case.accused
-        if not any_of(accused & named):
-            continue
-        for more, other in case.contesting():
+
+    def contest(accused: Bools, others: Iterable[tuple[float, Bools]]) -> None:
+        for more, other in others:
             kept = accused & named & ~other & ~contested
             if any_of(kept):
-                contested |= kept
+                contested[kept] = True
                 replacing.append(other)
                 # No more than J: few meters are likelier than many. What keeps names counts in the estimate.
                 cost = min(by_model[model][J.tobytes()] + max(more, GAIN), _COUNTS)
                 key = other.tobytes()
                 by_model[model][key] = min(cost, by_model[model].get(key, inf))
+
+    contest(J, every.singly(named))
+    cases = [(replace(every, accused=each), SPLITS) for each in sets]
+    while cases:
+        case, splits = cases.pop()
+        accused = case.accused
+        if not any_of(accused & named & ~contested):
+            continue
+        contest(accused, chain(case.contesting(), case.graded()))
         if splits and not any_of(accused & contested):
             cases += [(replace(case, accused=part), splits - 1) for part in _split(accused, near.laterals)]
     if not any_of(contested):
         return Weighed(found, contested)
     out = identified(found.problems, by_model, found.plain)
-    return Weighed(replace(out, named=out.named & ~contested[:p]), contested, tuple(replacing))
+    # A set that contests a name takes weight from others, and names no more.
+    sure = found.named & out.named & ~contested[:p]
+    return Weighed(replace(out, named=sure), contested, tuple(replacing))
 
 
 _SIGNS = (1.0, -1.0)
@@ -202,10 +238,12 @@ class _Case:
         Fault of each meter's customer that is its false power.
     known : (k, p)
         Sets of meters from which g is looked for, besides those of the relaxation.
+    sets : (q,) each
+        Sets of earlier searches, without masked meters.
     left
         Share of the evidence that J leaves open.
-    whole
-        L of J.
+    whole, fit
+        L of J, and its fit with amounts of any size.
     loose
         Bound of L without some faults; None for none.
     """
@@ -218,8 +256,10 @@ class _Case:
     most: int
     powers: Ints
     known: Bools
+    sets: tuple[Bools, ...]
     left: float
     whole: float
+    fit: float
     loose: _Loose | None
 
     @property
@@ -331,6 +371,58 @@ class _Case:
             chosen, least = sets[best], float(each[best])
             yield least, chosen
 
+    def graded(self) -> Iterator[tuple[float, Bools]]:
+        """Differences of the fits from that of J, and a set of meters with amounts of any size, (q,).
+
+        A descent by the fit begins at the meters of the rest, and has none of C.
+        """
+        least, loose = max(_LEAST, self.left * self._alone(self.accused)), self.loose
+        if loose is None or loose.without(self.accused, self.sign) + self.fit < least:
+            meter = np.arange(self.J.size) < self.problem.meters
+            yield from self._fitting(self._descended(self.rest & meter, ~meter | self.accused, 0), ())
+
+    def singly(self, named: Bools) -> Iterator[tuple[float, Bools]]:
+        """Such sets without one of the meters named, (q,): earlier ones, and the end of a descent from J."""
+        meter = np.arange(self.J.size) < self.problem.meters
+        each = named & meter
+        if self.loose is not None:
+            alone = _Fit(self.problem).lost(self.J)
+            bound = self.loose.without_each(np.sign(self.amount)) + self.fit
+            each = each & (bound < np.maximum(_LEAST, self.left * alone))
+        if any_of(each):
+            for one in (self._descended(self.J & meter, ~meter, 1), *self.sets):
+                yield from self._fitting(one, np.flatnonzero(each).tolist())
+
+    def _alone(self, which: Bools) -> float:
+        """Fit of J beyond that without some of its faults, (q,)."""
+        return self.fit - _fit(self.problem, self.J & ~which)
+
+    def _fitting(self, other: Bools, single: Sequence[int]) -> Iterator[tuple[float, Bools]]:
+        """A set (q,) and those without one of some meters, if they fit and keep the promise.
+
+        Where J leaves a misfit, a set of many meters fits better: it also has the faults of C that it needs.
+        """
+        for j in (-1, *(j for j in single if other[j])):
+            one = other & (np.arange(other.size) != j)
+            one |= self.accused & (_Fit(self.problem).gained(one) >= _LEAST)
+            if np.count_nonzero(one[: self.masked.size] | self.masked) <= self.largest:
+                more = self.fit - _fit(self.problem, one)
+                if more < max(_LEAST, self.left * self._alone(self.accused & ~one)):
+                    yield max(0.0, more), one
+
+    @property
+    def largest(self) -> int:
+        """Largest number of meters of a set with amounts of any size, the masked ones included."""
+        p = self.masked.size
+        own = np.count_nonzero(self.J[:p] | self.masked) + np.count_nonzero(self.J[p:])
+        return min(self.most, MORE * int(own))
+
+    def _descended(self, start: Bools, barred: Bools, beyond: int) -> Bools:
+        """End of a descent by the fit, with some meters beyond the promise at most, (q,)."""
+        p = self.problem.meters
+        room = self.largest + beyond - int(np.count_nonzero(self.masked & ~start[:p]))
+        return descend(_Fit(self.problem, barred, room).pivot(start)).chosen
+
     def _beginnings(self) -> list[tuple[Bools, tuple[float, ...]]]:
         """Sets that others are added to, (q,), and the signs of these: the rest, and parts of it."""
         rest, meter = self.rest, np.arange(self.J.size) < self.problem.meters
@@ -387,6 +479,17 @@ class _Loose:
         off = mean + bounded_minimum(precision, -(precision @ mean), np.zeros(at.size), inf)
         return self.least + float(off @ precision @ off)
 
+    def without_each(self, sign: Floats) -> Floats:
+        """The same without one fault, or with its amount of the reverse sign, for each fault, (q,).
+
+        Parameters
+        ----------
+        sign : (q,)
+            Sign of each amount; 0 for faults that stay.
+        """
+        off = np.maximum(sign * self.mean[self.place], 0.0)
+        return np.where(self.place >= 0, self.least + off * off / self.cov.diagonal()[self.place], self.least)
+
 
 def _split(accused: Bools, laterals: Bools) -> tuple[Bools, ...]:
     """Accused faults (q,) inside and outside of the lateral (g, p) with most meters of them, but not all.
@@ -407,6 +510,64 @@ def _evidence(problem: SearchProblem, sets: Bools) -> Floats:
     """L of sets, (k,), with amounts of their own and with amounts alike, the mean of both likelihoods."""
     count = np.count_nonzero(sets[:, : problem.meters], axis=1)
     return np.asarray(mixed(problem, sets) - penalties(problem.meters)[count])
+
+
+class _Fit(Tableau):
+    """Tableau with the fit as its cost: amounts of any size, and `PARAMETER` for each.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    barred : (q,)
+        Faults that stay outside; None: none.
+    room
+        Largest number of meters; None: all.
+    """
+
+    def __init__(self, problem: SearchProblem, barred: Bools | None = None, room: int | None = None) -> None:
+        p, q = problem.meters, problem.y.size
+        super().__init__(replace(problem, std=_wide(problem)))
+        self.barred |= np.zeros(q, dtype=np.bool_) if barred is None else barred
+        room = p if room is None else room
+        self.penalty = PARAMETER * np.arange(p + 1.0) + np.where(np.arange(p + 1) > room, _BEYOND, 0.0)
+
+    def gained(self, chosen: Bools) -> Floats:
+        """Gain of the fit by each fault beside a set, (q,); 0 for its own."""
+        return np.where(chosen, 0.0, self._toggled(chosen))
+
+    def lost(self, chosen: Bools) -> Floats:
+        """Loss of the fit without each fault of a set, (q,); 0 for others."""
+        return np.where(chosen, -self._toggled(chosen), 0.0)
+
+    def _toggled(self, chosen: Bools) -> Floats:
+        """Change of the fit by toggling each fault, from the tableau on a set, (q,)."""
+        self.pivot(chosen)
+        return np.asarray(self.columns[: chosen.size, 0] ** 2 / self.diagonal)
+
+    def steps(self) -> tuple[Floats, Floats]:
+        """Change of the cost by toggling each fault, and its amount times its pivot, (q,)."""
+        out, v = super().steps()
+        sign = np.where(self.chosen, -1.0, 1.0)
+        return out - np.log(np.abs(self.diagonal)) - sign * self.size, v
+
+    def pairs(self, out: Ints) -> tuple[Floats, Floats, Floats]:
+        """Change of the cost by pairs, as in `Tableau`."""
+        both, pull, pivot = super().pairs(out)
+        both -= np.log(np.abs(pivot)) + np.where(self.chosen, -1.0, 1.0) * self.size
+        both -= (np.log(-self.diagonal[out]) - self.size[out])[:, None]
+        return both, pull, pivot
+
+
+def _wide(problem: SearchProblem) -> Floats:
+    """Prior standard deviations with amounts of any size for meters, (q,)."""
+    meter = np.arange(problem.y.size) < problem.meters
+    return np.where(meter, np.maximum(problem.std, WIDE), problem.std)
+
+
+def _fit(problem: SearchProblem, chosen: Bools) -> float:
+    """Part ``y' (F + V^-1)^-1 y`` of the misfit that a set (q,) takes away, with amounts of any size."""
+    return float(problem.y[chosen] @ mean_amounts(replace(problem, std=_wide(problem)), chosen))
 
 
 def _beside(problem: SearchProblem, own: Bools, meters: Bools) -> tuple[Ints, Floats, Floats]:

@@ -24,7 +24,7 @@ off is no reason to doubt all others of its phase.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf
 
 import numpy as np
@@ -102,7 +102,11 @@ def reflected(found: Identification, near: Neighbourhoods, masked: Bools) -> Ide
             key = image.tobytes()
             if own + more < cost.get(key, np.inf):
                 cost[key], likelier = own + more, True
-    return identified(found.problems, found_by, found.plain) if likelier else found
+    if not likelier:
+        return found
+    out = identified(found.problems, found_by, found.plain)
+    # An image takes weight from other sets, and names no more.
+    return replace(out, named=found.named & out.named)
 
 
 def _images(

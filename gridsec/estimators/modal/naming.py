@@ -1,4 +1,4 @@
-"""Final names: meters that searches in turn accuse, masked together or where nothing depends on it.
+"""Final names: meters that searches in turn name, masked together or where nothing depends on it.
 
     final(found, before, named, streak, since, laterals) -> (p,)      meters to mask
     unseen(design, effect, most, lead, off) -> bool           steps by other clocks may explain them
@@ -6,8 +6,7 @@
 A search names the meters without which nothing explains the readings. The first explanation of several faults
 may be a part of them: names need searches in turn, `confirmed`. A sole fault is named by one search, and two
 readings: a step of the busbar is in one reading a tick early or late by clocks that differ by half a tick.
-With the next reading the amount of such a fault halves. Its name waits for as many searches as those of
-several faults.
+The next reading has nothing of such a fault. Its name waits for as many searches as those of several faults.
 
 **Parts of an explanation.** Masked meters have any amounts. With N the meters to mask, of the scores y and
 the information F of the others remain
@@ -39,9 +38,9 @@ from gridsec.estimators.modal.search import SOME, Identification, mixed
 TAP = 0.05
 """Largest step of a tap changer, squared pu: 2.5 % of the voltage."""
 CONFIRM = 2
-"""Readings of a sole fault before it is named, and searches in turn that accuse one of several."""
-LASTS = 0.75
-"""Least ratio of the amount of a sole fault to that of the search before, 1: one false reading has a half."""
+"""Readings of a sole fault before it is named, and searches in turn that name one of several."""
+LASTS = 0.5
+"""Least part of a sole fault in its last reading, 1: the reading is nearer to the fault than to none."""
 SEVERAL = 4
 """Searches in turn before a meter is named beside others that are not confirmed yet."""
 WHOLE = 4 * SEVERAL
@@ -95,29 +94,31 @@ def confirmed(
     named : (p,)
         Meters that it names newly.
     streak : (p,)
-        Searches in turn with each in the likeliest explanation.
+        Searches in turn that name each.
     since
         Ticks since the suspected onset; none where meters are masked, and may collude with others.
     """
     sole = any_of(named) and np.count_nonzero(found.chosen[0]) == 1
-    passing = sole and before is not None and _shrinks(found, before)
-    if sole and not passing:
-        readings = sum(seen is None or all_of(seen[named]) for _, _, seen, *_ in since)
-        if readings >= CONFIRM:
-            return named
+    readings = sum(seen is None or all_of(seen[named]) for _, _, seen, *_ in since)
+    passing = sole and before is not None and readings <= SEVERAL and _over(found, before, readings)
+    if sole and not passing and readings >= CONFIRM:
+        return named
     # Without a part of the meters, other faults may explain the rest: a few more searches may name all.
     least = CONFIRM if all_of(streak[named] >= CONFIRM) and not passing else SEVERAL
     return np.asarray(named & (streak >= least))
 
 
-def _shrinks(found: Identification, before: Identification) -> bool:
-    """The amount ``y / F`` of the sole fault of the likeliest set is less than `LASTS` of that before."""
+def _over(found: Identification, before: Identification, readings: int) -> bool:
+    """The last of some readings has less than `LASTS` of the sole fault of the likeliest set.
+
+    With the amounts ``x = y / F`` by n and by n - 1 readings, the last one has ``n x_n - (n - 1) x_(n-1)``.
+    """
     model, at = int(found.model[0]), int(np.flatnonzero(found.chosen[0])[0])
     if model >= len(before.problems):
         # A transition is a model of the last search only.
         return False
     now, then = (each.problems[model].y[at] / each.problems[model].F[at, at] for each in (found, before))
-    return bool(now / then < LASTS)
+    return bool(abs(readings * now - (readings - 1) * then) < LASTS * abs(then))
 
 
 def alone(found: Identification, masked: Bools) -> Bools:

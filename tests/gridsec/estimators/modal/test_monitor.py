@@ -51,9 +51,9 @@ def test_one_reading_of_the_meter_is_not_enough(since: list[Reading]) -> None:
     assert not confirmed(found(2), None, mask(2), NONE + mask(2), since).any()
 
 
-@pytest.mark.parametrize(("amount", "passes"), [(0.5, True), (1.0, False), (-0.2, True)])
-def test_a_sole_fault_of_which_the_amount_halves_waits(amount: float, passes: bool) -> None:
-    """As that of one false reading does with the next one; with unequal information of both searches."""
+@pytest.mark.parametrize(("amount", "passes"), [(0.5, True), (0.7, True), (1.0, False), (0.0, False)])
+def test_a_sole_fault_that_the_last_reading_has_not_waits(amount: float, passes: bool) -> None:
+    """Means of two readings after 1 for the first one: the second has 0, 0.4, 1 and -1."""
 
     def problem(x: float, F: float) -> SearchProblem:
         y = F * x * mask(2, size=P + 2)
