@@ -21,9 +21,9 @@ of that number. Where none weighs `DOUBT`, none names a meter.
 
 **Amounts of any size.** An adversary chooses the amounts, too. A set g of at most `MORE` meters for each
 fault of J, the masked ones included, has the fit ``E = y_g' (F_gg + V^-1)^-1 y_g`` with wide priors V. It
-contests the faults of C that it lacks where ``E(J) - E(g)`` is below the limit of above, and each of them
-gains less than `_LEAST` beside g. Such sets are ends of descents by the fit, from the rest without C and from
-all of J, these also without one meter, and the sets of earlier searches.
+contests the faults of C that it lacks where ``E(J) - E(g)`` is below `_LEAST`, and so is the gain by each of
+them beside g. Such sets are ends of descents by the fit, from the rest without C and from all of J, these
+also without one meter, and the sets of earlier searches.
 
 **Decoys.** A meter of C that no g replaces must not protect the others. Where no g keeps a name, the lateral
 with the most of C, but not all, splits it. Both parts are checked by themselves, and split again up to
@@ -376,8 +376,7 @@ class _Case:
 
         A descent by the fit begins at the meters of the rest, and has none of C.
         """
-        least, loose = max(_LEAST, self.left * self._alone(self.accused)), self.loose
-        if loose is None or loose.without(self.accused, self.sign) + self.fit < least:
+        if self.loose is None or self.loose.without(self.accused, self.sign) + self.fit < _LEAST:
             meter = np.arange(self.J.size) < self.problem.meters
             yield from self._fitting(self._descended(self.rest & meter, ~meter | self.accused, 0), ())
 
@@ -386,16 +385,10 @@ class _Case:
         meter = np.arange(self.J.size) < self.problem.meters
         each = named & meter
         if self.loose is not None:
-            alone = _Fit(self.problem).lost(self.J)
-            bound = self.loose.without_each(np.sign(self.amount)) + self.fit
-            each = each & (bound < np.maximum(_LEAST, self.left * alone))
+            each &= self.loose.without_each(np.sign(self.amount)) + self.fit < _LEAST
         if any_of(each):
             for one in (self._descended(self.J & meter, ~meter, 1), *self.sets):
                 yield from self._fitting(one, np.flatnonzero(each).tolist())
-
-    def _alone(self, which: Bools) -> float:
-        """Fit of J beyond that without some of its faults, (q,)."""
-        return self.fit - _fit(self.problem, self.J & ~which)
 
     def _fitting(self, other: Bools, single: Sequence[int]) -> Iterator[tuple[float, Bools]]:
         """A set (q,) and those without one of some meters, if they fit and keep the promise.
@@ -407,7 +400,7 @@ class _Case:
             one |= self.accused & (_Fit(self.problem).gained(one) >= _LEAST)
             if np.count_nonzero(one[: self.masked.size] | self.masked) <= self.largest:
                 more = self.fit - _fit(self.problem, one)
-                if more < max(_LEAST, self.left * self._alone(self.accused & ~one)):
+                if more < _LEAST:
                     yield max(0.0, more), one
 
     @property
@@ -534,16 +527,8 @@ class _Fit(Tableau):
 
     def gained(self, chosen: Bools) -> Floats:
         """Gain of the fit by each fault beside a set, (q,); 0 for its own."""
-        return np.where(chosen, 0.0, self._toggled(chosen))
-
-    def lost(self, chosen: Bools) -> Floats:
-        """Loss of the fit without each fault of a set, (q,); 0 for others."""
-        return np.where(chosen, -self._toggled(chosen), 0.0)
-
-    def _toggled(self, chosen: Bools) -> Floats:
-        """Change of the fit by toggling each fault, from the tableau on a set, (q,)."""
         self.pivot(chosen)
-        return np.asarray(self.columns[: chosen.size, 0] ** 2 / self.diagonal)
+        return np.where(chosen, 0.0, self.columns[: chosen.size, 0] ** 2 / self.diagonal)
 
     def steps(self) -> tuple[Floats, Floats]:
         """Change of the cost by toggling each fault, and its amount times its pivot, (q,)."""

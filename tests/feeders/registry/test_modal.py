@@ -112,7 +112,7 @@ def test_the_threshold_of_a_masked_meter_is_that_of_its_release() -> None:
     attacked_, honest = played()[0], played(0.0)[0]
     unread = site().meters[12]
     state, deviates = None, []
-    for frame in (*attacked_[: ONSET + 8], *honest[ONSET + 8 :]):
+    for frame in (*attacked_[: ONSET + 12], *honest[ONSET + 12 :]):
         p = np.where(np.arange(frame.p.size) == unread, np.nan, frame.p)
         before = None if state is None else state.core.masked
         state, _, verdicts = run([replace(frame, p=p)], state)

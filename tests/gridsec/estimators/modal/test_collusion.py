@@ -212,8 +212,7 @@ def by_fits(given: SearchProblem, accused: Bools, every: Bools) -> Bools:
             j for j in np.flatnonzero(accused & ~each) if fit(given, each | some(int(j))) - alone >= least
         ]
         one = each | some(*needed)
-        against = own - fit(given, accused & one)
-        if one.sum() <= largest and own - fit(given, one) < max(least, 0.1 * against):
+        if one.sum() <= largest and own - fit(given, one) < least:
             out |= accused & ~one
     return out
 
