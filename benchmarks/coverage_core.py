@@ -105,7 +105,8 @@ class Watch:
             return
         found = core.identify(self.kernel, self.state, evidence)
         named = found.found.named & ~self.state.masked.meters
-        streak = np.where(named, self.streak + 1, 0)
+        accused = found.found.chosen[0] & ~found.contested
+        streak = np.where(accused[: named.size], self.streak + 1, 0)
         self.phases = self.phases + 1 if verdict.certain_phases(self.kernel, found).any() else 0
         age = int(self.state.detector.onsets.age[found.row])
         before, self.suspicion, self.streak = self.suspicion, found, streak

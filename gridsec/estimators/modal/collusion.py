@@ -93,8 +93,8 @@ OPEN = 2.0
 """Share that a true set leaves open, in that of the set that suits the readings best, 1."""
 STARTS = 4
 """Sets of earlier searches and laterals that are improved besides those of the relaxation, 1."""
-WIDE = 0.03
-"""Least prior standard deviation of amounts of any size, squared pu: 1.5 % of the voltage."""
+WIDE = 0.02
+"""Prior standard deviation of amounts of any size, squared pu: 1 % of the voltage. Larger ones cost more."""
 MORE = 2
 """Meters with amounts of any size for each fault of J, 1: where far more are needed, their number decides."""
 PARAMETER = 2.0
@@ -547,7 +547,7 @@ class _Fit(Tableau):
 def _wide(problem: SearchProblem) -> Floats:
     """Prior standard deviations with amounts of any size for meters, (q,)."""
     meter = np.arange(problem.y.size) < problem.meters
-    return np.where(meter, np.maximum(problem.std, WIDE), problem.std)
+    return np.where(meter, WIDE, problem.std)
 
 
 def _fit(problem: SearchProblem, chosen: Bools) -> float:

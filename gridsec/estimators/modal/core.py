@@ -570,8 +570,8 @@ class Suspicion:
         Row of the onset.
     found
         The explanations.
-    contested : (b,)
-        Phases of the busbar with a meter that colluding meters may replace.
+    contested : (q,)
+        Meters and phases of the busbar that colluding meters may replace.
     fits
         The best one explains the misfit since then, and better than errors alike within the classes.
     settled
@@ -627,8 +627,7 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     share = _explained(state, found, age)
     fits = share >= EXPLAINED and not (age >= test.ticks and _aligned(core, found))
     found = found if fits else replace(found, named=np.zeros_like(found.named))
-    contested = weighed.contested[core.modes.size + core.faults.powers :]
-    return Suspicion(rows[best], found, contested, fits, fits and share >= SETTLED, replacing)
+    return Suspicion(rows[best], found, weighed.contested, fits, fits and share >= SETTLED, replacing)
 
 
 def _explained(state: CoreState, found: Identification, age: int) -> float:

@@ -16,10 +16,10 @@ A step, by module:
 The residual of a meter is its squared reading less the model; fixed errors are states of the filter.
 Registers err in proportion to v2: with b at 1 pu, ``b (v2 - 1)`` by the mean of b before the tick is no part
 of the residual. A meter is named when one search names it as the only fault with two readings, when
-searches in turn name it, when it repeats its readings beyond chance, or when it reads more than a voltage can
-be. Others of its explanation may delay it (`naming`). Named meters are masked from the onset on, and released
-by their readings (`masking`). The busbar's meter is named by searches in turn. Its phase then counts as not
-metered, until both agree.
+searches in turn accuse it, when it repeats its readings beyond chance, or when it reads more than a voltage
+can be. Others of its explanation may delay it (`naming`). Named meters are masked from the onset on, and
+released by their readings (`masking`). The busbar's meter is named by searches in turn. Its phase then counts
+as not metered, until both agree.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ class ModalState:
     suspicion
         Explanations of the last search, while they hold.
     streak : (p,)
-        Searches in turn that name each meter.
+        Searches in turn with each meter in the likeliest explanation, and replaced by no colluding ones.
     phases : (b,)
         Searches in turn that name each phase of the busbar with a meter.
     inverters : (m,)
@@ -383,7 +383,8 @@ def _named(
     kernel, tick, masked = design.core, state.front.ticks, state.core.masked.meters
     age = int(state.core.detector.onsets.age[suspicion.row])
     named = suspicion.found.named & ~masked
-    streak = np.where(named, state.streak + 1, 0)
+    accused = suspicion.found.chosen[0] & ~suspicion.contested
+    streak = np.where(accused[: named.size], state.streak + 1, 0)
     certain = verdict.certain_phases(kernel, suspicion) & suspicion.fits
     phases = np.where(certain, state.phases + 1, 0)
     certain = verdict.certain_inverters(design.front, kernel, suspicion, uses_q) & suspicion.fits

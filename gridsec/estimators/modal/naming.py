@@ -1,4 +1,4 @@
-"""Final names: meters that searches in turn name, masked together or where nothing depends on it.
+"""Final names: meters that searches in turn accuse, masked together or where nothing depends on it.
 
     final(found, before, named, streak, since, laterals) -> (p,)      meters to mask
     unseen(design, effect, most, lead, off) -> bool           steps by other clocks may explain them
@@ -38,7 +38,7 @@ from gridsec.estimators.modal.search import SOME, Identification, mixed
 TAP = 0.05
 """Largest step of a tap changer, squared pu: 2.5 % of the voltage."""
 CONFIRM = 2
-"""Readings of a sole fault before it is named, and searches in turn that name one of several."""
+"""Readings of a sole fault before it is named, and searches in turn that accuse one of several."""
 LASTS = 0.5
 """Least part of a sole fault in its last reading, 1: the reading is nearer to the fault than to none."""
 SEVERAL = 4
@@ -94,7 +94,7 @@ def confirmed(
     named : (p,)
         Meters that it names newly.
     streak : (p,)
-        Searches in turn that name each.
+        Searches in turn with each in the likeliest explanation, and replaced by no others.
     since
         Ticks since the suspected onset; none where meters are masked, and may collude with others.
     """

@@ -361,7 +361,7 @@ def certain_phases(core: Core, suspicion: Suspicion) -> Bools:
         The core, and the explanations.
     """
     found, first = suspicion.found, core.modes.size + core.faults.powers
-    return np.asarray(found.certain[first:] & ~suspicion.contested)
+    return np.asarray(found.certain[first:] & ~suspicion.contested[first:])
 
 
 def share(  # noqa: PLR0917  # the core, and one report

@@ -54,6 +54,12 @@ def near(most: int, *, powers: bool = False) -> Neighbourhoods:
     return Neighbourhoods(np.vstack([laterals, whole]), np.ones((METERS, 1), dtype=np.bool_), most, own)
 
 
+@pytest.fixture(autouse=True)
+def unit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Amounts of any size have the prior size of these problems."""
+    monkeypatch.setattr(collusion, "WIDE", 1.0)
+
+
 def some(*meters: int) -> Bools:
     """Places of meters, (p,)."""
     return np.isin(np.arange(METERS), meters)
