@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -175,13 +176,12 @@ def test_powers_of_a_stated_age_are_unknown_directions_of_every_frame(site: Site
     assert np.abs(fresh.places).max() < 0.2 * np.abs(late.places).max()
 
 
-@pytest.mark.canary("p_interval_s")
-@pytest.mark.parametrize("stated", ["t_power", "p_interval_s"])
-def test_kettles_and_cars_accuse_no_meter_once_the_age_is_stated(stated: str) -> None:
+@pytest.mark.acceptance
+def test_kettles_and_cars_accuse_no_meter_once_the_age_is_stated() -> None:
     """Powers 60 s old: without the age most ticks of these runs are open, with it none is."""
     unstated = run(0, 600, "late", "")[0]
     assert unstated["clean"] < 0.1 * unstated["ticks"]
-    for seed in (0, 1):
+    for stated, seed in product(("t_power", "p_interval_s"), (0, 1)):
         seen, _, of_bound = run(seed, 600, "late", stated)
         assert seen["honest"] == 0
         assert of_bound <= 1.0

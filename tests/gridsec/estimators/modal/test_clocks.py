@@ -57,6 +57,7 @@ def calm(_: int) -> None:
     """Nothing changes but the loads' own variations."""
 
 
+@pytest.mark.canary("4-8-2.0")
 @pytest.mark.parametrize(("seed", "count", "power_kw"), [(3, 4, 3.0), (4, 4, 3.0), (4, 8, 2.0)])
 def test_boilers_that_are_switched_together_name_no_meter(seed: int, count: int, power_kw: float) -> None:
     """The meters of these customers are 10 s ahead, and show the common step after all others."""
