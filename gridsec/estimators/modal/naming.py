@@ -117,8 +117,10 @@ def _over(found: Identification, before: Identification, readings: int) -> bool:
     if model >= len(before.problems):
         # A transition is a model of the last search only.
         return False
-    now, then = (each.problems[model].y[at] / each.problems[model].F[at, at] for each in (found, before))
-    return bool(abs(readings * now - (readings - 1) * then) < LASTS * abs(then))
+    now, then = found.problems[model], before.problems[model]
+    # Times the information of both: it is 0 before the first reading.
+    last = readings * now.y[at] * then.F[at, at] - (readings - 1) * then.y[at] * now.F[at, at]
+    return bool(abs(last) < LASTS * abs(then.y[at]) * now.F[at, at])
 
 
 def alone(found: Identification, masked: Bools) -> Bools:
