@@ -23,7 +23,8 @@ of that number. Where none weighs `DOUBT`, none names a meter.
 fault of J, the masked ones included, has the fit ``E = y_g' (F_gg + V^-1)^-1 y_g`` with wide priors V. It
 contests the faults of C that it lacks where ``E(J) - E(g)`` is below `_LEAST`, and so is the gain by each of
 them beside g. Such sets are ends of descents by the fit, from the rest without C and from all of J, these
-also without one meter, and the sets of earlier searches.
+also without one meter, and the sets of earlier searches. Where most powers are read, only explanations with
+faults that are no meters are doubted so: loads leave little room for others.
 
 **Decoys.** A meter of C that no g replaces must not protect the others. Where no g keeps a name, the lateral
 with the most of C, but not all, splits it. Both parts are checked by themselves, and split again up to
@@ -130,6 +131,8 @@ def weighed(
     near: Neighbourhoods,
     left: float = inf,
     known: Sequence[Bools] = (),
+    *,
+    unread: bool = True,
 ) -> Weighed:
     """Explanations with sets of meters that may replace accused ones.
 
@@ -145,6 +148,8 @@ def weighed(
         Share of the misfit that the likeliest explanation leaves.
     known : (q,) each
         Such sets of earlier searches.
+    unread
+        Many powers are unread: amounts of any size also contest meters that are accused alone.
     """
     p, one = found.named.size, found.chosen[0]
     first = one.size - near.phases.shape[1]
@@ -169,7 +174,7 @@ def weighed(
     sets += [np.arange(J.size) == k for k in np.flatnonzero(J[first:]) + first]
     whole, loose = float(_evidence(problem, J[None])[0]), _Loose.of(problem, J)
     begun = np.vstack([near.laterals, *(each[:p] for each in known)])
-    unread = np.append(~informed(problem), np.zeros(J.size - p, dtype=np.bool_))
+    silent = np.append(~informed(problem), np.zeros(J.size - p, dtype=np.bool_))
     every = _Case(
         problem,
         J,
@@ -179,7 +184,7 @@ def weighed(
         most,
         near.powers,
         begun,
-        tuple(each & ~unread for each in known),
+        tuple(each & ~silent for each in known),
         min(MISFIT, OPEN * left),
         whole,
         _fit(problem, J),
@@ -197,14 +202,16 @@ def weighed(
                 key = other.tobytes()
                 by_model[model][key] = min(cost, by_model[model].get(key, inf))
 
-    contest(J, every.singly(named))
+    any_size = unread or any_of(J[p:])
+    if any_size:
+        contest(J, every.singly(named))
     cases = [(replace(every, accused=each), SPLITS) for each in sets]
     while cases:
         case, splits = cases.pop()
         accused = case.accused
         if not any_of(accused & named & ~contested):
             continue
-        contest(accused, chain(case.contesting(), case.graded()))
+        contest(accused, chain(case.contesting(), case.graded() if any_size else ()))
         if splits and not any_of(accused & contested):
             cases += [(replace(case, accused=part), splits - 1) for part in _split(accused, near.laterals)]
     if not any_of(contested):

@@ -88,6 +88,8 @@ WAITS = 2 * PASSED
 """Ticks of a suspicion in which the misfit before another onset speaks against that, 1."""
 TRIALS = 4
 """Trials of a transition while the age of an onset doubles, about, 1: the replay takes a second or so."""
+UNREAD = 0.25
+"""Unknown directions for each meter from which on many powers are unread, 1: two for each unread power."""
 RECALLED = 24
 """Largest number of explanations that the next search knows, 1."""
 CALM = 0.5
@@ -621,7 +623,9 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     age = int(test.onsets.age[rows[best]])
     found = mirrors.reflected(found, core.near, state.masked.meters)
     replacing = () if before is None else before.replacing
-    weighed = collusion.weighed(found, state.masked.meters, core.near, _left(state, found, age), replacing)
+    left = _left(state, found, age)
+    unread = unknown is not None and unknown.shape[1] >= UNREAD * core.modes.size
+    weighed = collusion.weighed(found, state.masked.meters, core.near, left, replacing, unread=unread)
     sets = {each.tobytes(): each for each in (*weighed.replacing, *replacing)}
     found, replacing = weighed.found, tuple(sets.values())[:RECALLED]
     share = _explained(state, found, age)

@@ -257,6 +257,9 @@ def test_the_evidence_against_meters_that_a_set_lacks_is_compared(
     found = contested(explanation(given, accused), NONE, 4)
     assert (found == some(*members)).all()
     assert (found == by_enumeration(given, accused, 1.0, 4)).all()
+    # With most powers read, amounts of any size contest no meters that are accused alone.
+    read = collusion.weighed(explanation(given, accused), NONE, near(4), unread=False)
+    assert (read.found.named == accused & ~(some(4) & (amount < 0.5))).all()
 
 
 def test_a_set_that_contests_a_part_is_reported() -> None:
