@@ -105,14 +105,12 @@ class Watch:
             return
         found = core.identify(self.kernel, self.state, evidence)
         named = found.found.named & ~self.state.masked.meters
-        accused = found.found.chosen[0] & ~found.contested
-        streak = np.where(accused[: named.size], self.streak + 1, 0)
+        streak = np.where(found.accused[: named.size], self.streak + 1, 0)
         self.phases = self.phases + 1 if verdict.certain_phases(self.kernel, found).any() else 0
         age = int(self.state.detector.onsets.age[found.row])
-        before, self.suspicion, self.streak = self.suspicion, found, streak
+        earlier, self.suspicion, self.streak = found.earlier(self.suspicion), found, streak
         self.due = tick + (1 if (streak[named] == 1).any() or self.phases == 1 else max(1, age // LOOKS))
         since = () if self.state.masked.meters.any() else self.state.history.readings[-age:]
-        earlier = before.found if before is not None and before.row == found.row else None
         sure = confirmed(found.found, earlier, named, streak, since)
         if sure.any():
             final = replace(found, found=replace(found.found, named=sure))

@@ -76,7 +76,7 @@ from gridsec.estimators.modal.costs import (
 )
 from gridsec.estimators.modal.laterals import GAIN, OneAmount
 from gridsec.estimators.modal.mirrors import Neighbourhoods
-from gridsec.estimators.modal.search import DOUBT, Identification, costs_of, descend, identified, mixed
+from gridsec.estimators.modal.search import DOUBT, Identification, costs_of, descend, extended, mixed
 
 MISFIT = 0.1
 """Largest share of an explanation's evidence that steps and ramps leave open, 1."""
@@ -211,15 +211,14 @@ def weighed(
         accused = case.accused
         if not any_of(accused & named & ~contested):
             continue
-        contest(accused, chain(case.contesting(), case.graded() if any_size else ()))
+        least = case.bound()
+        contest(accused, chain(case.contesting(least), case.graded(least) if any_size else ()))
         if splits and not any_of(accused & contested):
             cases += [(replace(case, accused=part), splits - 1) for part in _split(accused, near.laterals)]
     if not any_of(contested):
         return Weighed(found, contested)
-    out = identified(found.problems, by_model, found.plain)
-    # A set that contests a name takes weight from others, and names no more.
-    sure = found.named & out.named & ~contested[:p]
-    return Weighed(replace(out, named=sure), contested, tuple(replacing))
+    out = extended(found, by_model)
+    return Weighed(replace(out, named=out.named & ~contested[:p]), contested, tuple(replacing))
 
 
 _SIGNS = (1.0, -1.0)
@@ -284,12 +283,20 @@ class _Case:
         """Sign of their amounts."""
         return float(np.sign(self.amount[self.accused][0]))
 
-    def contesting(self) -> list[tuple[float, Bools]]:
-        """Differences of L from J, and sets (q,) that keep names of C: those without any of C, then by L."""
+    def bound(self) -> float:
+        """Bound of L and of the reverse of the fit, without C or with the reverse sign of its meters."""
+        return -inf if self.loose is None else self.loose.without(self.accused, self.sign)
+
+    def contesting(self, least: float) -> list[tuple[float, Bools]]:
+        """Differences of L from J, and sets (q,) that keep names of C: those without any of C, then by L.
+
+        Parameters
+        ----------
+        least
+            The bound.
+        """
         without = float(_evidence(self.problem, self.rest[None])[0])
-        excluded = self.loose is not None and (
-            self.loose.without(self.accused, self.sign) > self._limit(self.whole, without) + ALIKE_LESS
-        )
+        excluded = least > self._limit(self.whole, without) + ALIKE_LESS
         if excluded and not any_of(self.J[self.problem.meters :]):
             return []
         own = self.own(without)
@@ -378,12 +385,17 @@ class _Case:
             chosen, least = sets[best], float(each[best])
             yield least, chosen
 
-    def graded(self) -> Iterator[tuple[float, Bools]]:
+    def graded(self, least: float) -> Iterator[tuple[float, Bools]]:
         """Differences of the fits from that of J, and a set of meters with amounts of any size, (q,).
 
         A descent by the fit begins at the meters of the rest, and has none of C.
+
+        Parameters
+        ----------
+        least
+            The bound.
         """
-        if self.loose is None or self.loose.without(self.accused, self.sign) + self.fit < _LEAST:
+        if least + self.fit < _LEAST:
             meter = np.arange(self.J.size) < self.problem.meters
             yield from self._fitting(self._descended(self.rest & meter, ~meter | self.accused, 0), ())
 

@@ -589,6 +589,15 @@ class Suspicion:
     settled: bool = True
     replacing: tuple[Bools, ...] = field(default=(), repr=False)
 
+    @property
+    def accused(self) -> Bools:
+        """Faults of the likeliest explanation that no colluding meters replace, (q,)."""
+        return np.asarray(self.found.chosen[0] & ~self.contested)
+
+    def earlier(self, before: Suspicion | None) -> Identification | None:
+        """What an earlier search found, if it was made at the same onset."""
+        return before.found if before is not None and before.row == self.row else None
+
 
 def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion | None = None) -> Suspicion:
     """Sets of faults that explain the readings, since the onset that suits them best.

@@ -24,7 +24,7 @@ off is no reason to doubt all others of its phase.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from math import inf
 
 import numpy as np
@@ -42,7 +42,7 @@ from gridsec.estimators.modal.costs import (
 )
 from gridsec.estimators.modal.laterals import clusters, coded, similar
 from gridsec.estimators.modal.model import Modes
-from gridsec.estimators.modal.search import ALIKE, Identification, costs_of, identified
+from gridsec.estimators.modal.search import ALIKE, Identification, costs_of, extended
 
 REFLECTED = 0.01
 """Weight from which on an explanation has mirror images, 1: that of reported explanations."""
@@ -102,11 +102,7 @@ def reflected(found: Identification, near: Neighbourhoods, masked: Bools) -> Ide
             key = image.tobytes()
             if own + more < cost.get(key, np.inf):
                 cost[key], likelier = own + more, True
-    if not likelier:
-        return found
-    out = identified(found.problems, found_by, found.plain)
-    # An image takes weight from other sets, and names no more.
-    return replace(out, named=found.named & out.named)
+    return extended(found, found_by) if likelier else found
 
 
 def _images(

@@ -383,8 +383,7 @@ def _named(
     kernel, tick, masked = design.core, state.front.ticks, state.core.masked.meters
     age = int(state.core.detector.onsets.age[suspicion.row])
     named = suspicion.found.named & ~masked
-    accused = suspicion.found.chosen[0] & ~suspicion.contested
-    streak = np.where(accused[: named.size], state.streak + 1, 0)
+    streak = np.where(suspicion.accused[: named.size], state.streak + 1, 0)
     certain = verdict.certain_phases(kernel, suspicion) & suspicion.fits
     phases = np.where(certain, state.phases + 1, 0)
     certain = verdict.certain_inverters(design.front, kernel, suspicion, uses_q) & suspicion.fits
@@ -392,9 +391,8 @@ def _named(
     # A fault with a first naming is searched again at the next tick.
     first = any((each == 1).any() for each in (streak[named], phases, inverters))
     wait = 1 if first else max(1, age // LOOKS)
-    due, before = tick + wait, state.suspicion
+    due, earlier = tick + wait, suspicion.earlier(state.suspicion)
     after = replace(state, suspicion=suspicion, streak=streak, phases=phases, inverters=inverters, due=due)
-    earlier = before.found if before is not None and before.row == suspicion.row else None
     since = () if any_of(masked) else state.core.history.readings[-age:]
     sure = final(suspicion.found, earlier, named, streak, since, kernel.near.laterals)
     if suspicion.fits and not any_of(sure):

@@ -221,7 +221,7 @@ def search(
         More sets that count, as those of an earlier search, which descents may miss; None: none.
     """
     read = informed(problem)
-    groups = tuple(each[read[each]] for each in groups) if not read.all() else groups
+    groups = tuple(each[read[each]] for each in groups if read[each].any())
     batches = together(groups)
     whole = np.zeros((0, problem.meters)) if laterals is None else (laterals & read).astype(np.float64)
     start, nothing = relevant(problem), np.zeros(problem.y.size, dtype=np.bool_)
@@ -526,6 +526,12 @@ def identified(
     model = np.array([k for _, k, _ in every])[kept]
     named = _certain(chosen, weight, plain)[: problems[0].meters]
     return Identification(chosen, model, weight, named, problems, plain)
+
+
+def extended(found: Identification, costs: Sequence[dict[bytes, float]]) -> Identification:
+    """Explanations with more sets, by the costs of all: these take weight from others, and name no more."""
+    out = identified(found.problems, costs, found.plain)
+    return replace(out, named=found.named & out.named)
 
 
 def _certain(chosen: Bools, weight: Floats, plain: Bools | None) -> Bools:

@@ -155,3 +155,15 @@ def test_sets_with_impossible_amounts_are_not_recalled() -> None:
         found = {np.zeros(10, dtype=np.bool_).tobytes(): 1e6}
         s._recalled(each, found, chosen[None])
         assert len(found) == count
+
+
+def test_a_group_without_readings_is_no_step() -> None:
+    """Scores and information of two meters are 0: the explanations are those of a search without their group."""
+    given, unread = problem(2, p=8, others=1), np.isin(np.arange(9), [5, 6])
+    given = replace(
+        given, y=np.where(unread, 0.0, given.y), F=np.where(unread[:, None] | unread, 0.0, given.F)
+    )
+    groups = (np.array([0, 1]), np.array([2, 3, 4]))
+    some, other = s.search(given, groups), s.search(given, (np.array([5, 6]), *groups))
+    assert (some.chosen == other.chosen).all()
+    assert not other.chosen[:, [5, 6]].any()
