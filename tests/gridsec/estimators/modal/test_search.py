@@ -158,7 +158,7 @@ def test_sets_with_impossible_amounts_are_not_recalled() -> None:
 
 
 def test_a_group_without_readings_is_no_step() -> None:
-    """Scores and information of two meters are 0: the explanations are those of a search without their group."""
+    """Scores and information of two meters are 0: a search with their group finds the same explanations."""
     given, unread = problem(2, p=8, others=1), np.isin(np.arange(9), [5, 6])
     given = replace(
         given, y=np.where(unread, 0.0, given.y), F=np.where(unread[:, None] | unread, 0.0, given.F)
