@@ -595,7 +595,7 @@ class Suspicion:
         return np.asarray(self.found.chosen[0] & ~self.contested)
 
     def earlier(self, before: Suspicion | None) -> Identification | None:
-        """What an earlier search found, if it was made at the same onset."""
+        """Explanations of an earlier search, if it was made at the same onset."""
         return before.found if before is not None and before.row == self.row else None
 
 
