@@ -798,19 +798,22 @@ def _level(core: Core, state: CoreState, row: int) -> float:
 
 
 def _moves(core: Core, state: CoreState, row: int, model: int, used: Bools) -> Floats:
-    """Change of the estimate per amount of each used fault, (n, q), under a model by its number.
+    """Change of the estimate per amount of each used fault, as `estimate.moves`, under a model by its number.
 
     The onset is a row of the model, 0, or that of a rival.
     """
-    p, rival, out = core.modes.size, state.rivals[model] if model else None, np.zeros_like(core.effect)
+    p, rival = core.modes.size, state.rivals[model] if model else None
+    filtered = rival.filter if rival else state.filter
+    opened = filtered.full is not None and filtered.full.unknown is not None
+    out = np.zeros((len(core.effect) + p * opened, used.size))
     if not any_of(used):
         return out
     since: Suspected | Joint | None
     if rival is None:
-        filtered, since = state.filter, next((each for each in state.suspected if each.row == row), None)
+        since = next((each for each in state.suspected if each.row == row), None)
         since = since or _joint(core, _parts(state), row)
     else:
-        filtered, since = rival.filter, rival.suspected or rival.joint()
+        since = rival.suspected or rival.joint()
     x = np.hstack([np.eye(p)[:, used[:p]], core.faults.beside[:, used[p:]]])
     out[:, used] = estimates.moves(core.modes, core.estimator, filtered, since, x, core.effect[:, used])
     return out
@@ -879,12 +882,12 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     """
     if state.update is None:
         raise InputInvalid([Problem("missing", "no reading is available yet")])
-    made, by = core.modes, core.estimator
-    plain = estimates.honest(made, by, state.filter, state.static, loads=state.loads)
+    made, by, m = core.modes, core.estimator, state.history.readings[-1][1]
+    plain = estimates.honest(made, by, state.filter, state.static, loads=state.loads, m=m)
     if suspicion is None:
         return plain
     others = (
-        estimates.honest(each.modes, by, each.filter, each.static, loads=each.loads)
+        estimates.honest(each.modes, by, each.filter, each.static, loads=each.loads, m=m)
         for each in state.rivals[1:]
     )
     before = [plain, *others]

@@ -8,7 +8,11 @@ Given the states w, b and the white errors e of the members, in their modes,
 
 and what is left is independent of all readings: the loads have one correlation time, so that w_x beyond
 S_xT is another AR(1) process. With ``e = z - w - b``, z being the readings in the modes, the estimate is
-linear in the posterior of (w, b, theta), and its variance follows.
+linear in the posterior of (w, b, theta), and its variance follows. With A the unknown directions of the tick,
+
+    E e_x = phi H_x H' (D + A A')^-1 (z - w - b)
+
+in the coordinates of the meters: most of the rest is that of the unknown directions.
 
 A fault f at an onset moves the filter by its signature g and the residuals by u f; false powers and a false
 busbar voltage move the model as well, by ``effect``. With amounts of the mean f and the covariance of
@@ -99,10 +103,14 @@ class Estimated:
         Expected true squared voltage minus that of the model, squared pu.
     spread
         The variance of the mean, (n,), squared pu^2. It takes longer than the rest of a step.
+    rest : (t,) or None
+        Residuals of the last tick less the means of w, b and the faults, squared pu; None without unknown
+        directions.
     """
 
     mean: Floats
     spread: Callable[[], Floats] = field(repr=False)
+    rest: Floats | None = None
 
     @cached_property
     def variance(self) -> Floats:
@@ -155,6 +163,7 @@ def honest(
     static: Static,
     *,
     loads: float = 1.0,
+    m: Floats | None = None,
 ) -> Estimated:
     """Estimate without a fault; O(n t).
 
@@ -168,11 +177,17 @@ def honest(
         The filter after the last tick, and the information about the directions.
     loads
         Variance of the loads' errors that vary, in those of the model, 1.
+    m : (t,)
+        Residuals of the last tick, for the rest beside unknown directions.
     """
     if state.full is not None:
         w, b = state.full.mean @ modes.U
-        mean = _mean(made, w, b, static.score)
-        return Estimated(mean, partial(_full_variance, modes, made, state.full, loads))
+        mean, spread = (
+            _mean(made, w, b, static.score),
+            partial(_full_variance, modes, made, state.full, loads),
+        )
+        known = m is None or state.full.unknown is None
+        return Estimated(mean, spread, None if known else m - state.full.mean.sum(axis=0))
     w, b = state.mean
     if modes.sign.size:
         g_w, g_b = static.signature
@@ -225,6 +240,8 @@ def moves(  # noqa: PLR0917  # the state, and the faults
 ) -> Floats:
     """Change of the honest estimate by some faults since one onset, (n, k).
 
+    With unknown directions, t rows follow: the change of `Estimated.rest` when the faults are taken away.
+
     Parameters
     ----------
     modes, made, state
@@ -240,19 +257,23 @@ def moves(  # noqa: PLR0917  # the state, and the faults
     felt = since.level * (modes.U.T @ x) - w - b
     if state.full is None:
         return np.asarray(effect - _mean(made, w, b, felt))
-    places, by_e = _flicker(modes, state.full)
-    return np.asarray(effect - _mean(made, w, b, np.zeros_like(felt)) - places @ ((by_e @ modes.back) @ felt))
+    (places, by_e), felt = _flicker(modes, state.full), modes.back @ felt
+    moved = effect - _mean(made, w, b, np.zeros_like(felt)) - places @ (by_e @ felt)
+    return np.asarray(moved if state.full.unknown is None else np.vstack([moved, -felt]))
 
 
 def _flicker(modes: Modes, full: Full) -> tuple[Floats, Floats]:
-    """Factors of the regression of the flicker at all places on the white errors of members, (n, b), (b, t).
+    """Factors of the regression of the flicker at all places on z - w - b of the members, (n, b), (b, t).
 
     Of members with a reading.
     """
     model, n = modes.model, indices(full.seen)
     by_e = np.zeros((modes.size, model.busbar_of.shape[1]))
     if n.size:
-        by_e[n] = np.linalg.solve(submatrix(modes.noise, n, n), model.phases(modes.at[n]))
+        noise = submatrix(modes.noise, n, n)
+        if full.unknown is not None:
+            noise = noise + full.unknown[n] @ full.unknown[n].T
+        by_e[n] = np.linalg.solve(noise, model.phases(modes.at[n]))
     return model.flicker * model.busbar_of, by_e.T
 
 
@@ -272,13 +293,14 @@ def corrected(before: Sequence[Estimated], T: Sequence[Floats], found: Identific
     weight = found.weight[counted] / found.weight[counted].sum()
     model, chosen = found.model[counted], found.chosen[counted]
     means, by_amounts = np.empty((weight.size, len(T[0]))), np.zeros(len(T[0]))
-    models = np.unique(model).tolist()
+    models, n = np.unique(model).tolist(), before[0].mean.size
     for k in models:
         of = model == k
         moved, variance = explained(found.problems[k], chosen[of], weight[of], T[k])
-        means[of] = before[k].mean + moved
+        means[of] = np.concatenate([before[k].mean, *_rest(before[k])]) + moved
         by_amounts += variance
-    mean = weight @ means
+    mean, rest = np.split(weight @ means, [n])
+    means, by_amounts = means[:, :n], by_amounts[:n]
 
     def spread() -> Floats:
         before_each = sum(weight[model == k].sum() * before[k].variance for k in models)
@@ -286,7 +308,11 @@ def corrected(before: Sequence[Estimated], T: Sequence[Floats], found: Identific
         possible = apart[weight >= DOUBT].max(axis=0)
         return np.asarray(np.maximum(before_each + by_amounts + weight @ apart, POSSIBLE * possible))
 
-    return Estimated(mean, spread)
+    return Estimated(mean, spread, rest if rest.size else None)
+
+
+def _rest(each: Estimated) -> tuple[Floats, ...]:
+    return () if each.rest is None else (each.rest,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

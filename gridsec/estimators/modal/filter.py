@@ -78,6 +78,8 @@ class Full:
         Part of each mode's information that was read; None where all readings are there.
     since
         Ticks since ``share`` was computed.
+    unknown : (t, k) or None
+        Directions of the residuals that were unknown at the last tick, times their standard deviations.
     """
 
     mean: Floats
@@ -87,6 +89,7 @@ class Full:
     complete: int
     share: Floats | None = field(default=None, repr=False)
     since: int = 0
+    unknown: Floats | None = field(default=None, repr=False)
 
     @property
     def cov(self) -> Floats:

@@ -615,19 +615,15 @@ def _estimate(
     front, kernel, measured = design.front, design.core, tick.measured
     plant, now = front.plant, state.front
     errors = core.estimate(kernel, state.core, state.suspicion)
-    mean, whole, more = errors.mean, state.core.filter.full, None
-    if tick.unknown is not None and whole is not None:
-        u, read = tick.m - whole.mean[0] - whole.mean[1], whole.seen
+    mean, whole, more, metered = errors.mean, state.core.filter.full, None, measured.busbar_metered
+    if tick.unknown is not None and whole is not None and errors.rest is not None:
+        read, hidden = whole.seen, _hidden(state.core, tick.unknown)
         if state.suspicion is not None:
-            # Readings and means without the suspected manipulations.
-            plain = core.estimate(kernel, state.core)
-            u = u - (mean - plain.mean)[front.prior.meters]
             read = read & ~verdict.accused(kernel, state.suspicion)
-        hidden = _hidden(state.core, tick.unknown)
-        off, more = doubts.estimated(kernel.modes.noise + whole.whole, tick.unknown, u, read, hidden=hidden)
+        noise = kernel.modes.noise + whole.whole
+        off, more = doubts.estimated(noise, tick.unknown, errors.rest, read, hidden=hidden)
         mean = mean + off
     v2_bus, first = tick.predicted.v2_bus + mean, plant.feeder.busbar_places()
-    metered = measured.busbar_metered
     least: Floats | float = front.busbar**2
     if all_of(np.asarray(metered)):
         v2_bus[first] = measured.v0_squared
@@ -641,13 +637,20 @@ def _estimate(
         powers=powers if powers.trusted is now.trust.trusted else changed(powers, trusted=now.trust.trusted),
         injected=tick.predicted.injection_error.error,
         model=tick.predicted.v2_bus[plant.feeder.bus],
-        busbar=metered,
+        busbar=_bounding(design, state, metered),
         y=measured.y,
         trusted=sure,
         checked=partial(checked, front, measured.frame),
         sigmas=front.sigmas,
     )
     return Reconstructed.later(inputs, measured.frame.t, v2_bus, spread, tick.predicted.x), spread
+
+
+def _bounding(design: ModalDesign, state: ModalState, metered: Bools | bool) -> Bools | bool:
+    """Phases of the busbar with a reading that bounds the voltages: none that may be manipulated."""
+    if state.suspicion is not None:
+        return np.asarray(metered & ~verdict.accused_phases(design.core, state.suspicion))
+    return metered if not any_of(state.core.detector.pinned) else np.zeros_like(metered)
 
 
 def own_errors(design: ModalDesign, state: CoreState) -> Floats:

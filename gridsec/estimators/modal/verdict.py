@@ -352,6 +352,15 @@ def accused(core: Core, suspicion: Suspicion) -> Bools:
     return np.asarray(found.chosen[found.weight >= LIKELY, : core.modes.size].any(axis=0))
 
 
+def accused_phases(core: Core, suspicion: Suspicion) -> Bools:
+    """Phases of the busbar with a meter that a likely explanation accuses, (b,); b counts all phases."""
+    found, first = suspicion.found, core.modes.size + core.faults.powers
+    some = core.modes.model.phases(core.modes.at).any(axis=0)
+    out = np.zeros(some.size, dtype=np.bool_)
+    out[some] = found.chosen[found.weight >= LIKELY, first:].any(axis=0)
+    return out
+
+
 def certain_phases(core: Core, suspicion: Suspicion) -> Bools:
     """Phases of the busbar that nothing replaces in explanations, (b,); b counts those with a meter.
 

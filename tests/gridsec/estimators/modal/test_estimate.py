@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks._residuals import Source, model_of, power_columns, root, tree
 from gridsec.arrays import Floats
-from gridsec.estimators.modal import estimate, full, signatures, static
+from gridsec.estimators.modal import estimate, full, replay, signatures, static
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.costs import SearchProblem, amounts
 from gridsec.estimators.modal.model import ResidualModel, modes
@@ -33,9 +33,18 @@ def some_meters(meters: int = 5, **given: float) -> ResidualModel:
 
 
 def joint(  # noqa: PLR0917  # everything that moves the readings
-    model: ResidualModel, m: Floats, G: Floats, effect: Floats, onset: int, std: float
+    model: ResidualModel,
+    m: Floats,
+    G: Floats,
+    effect: Floats,
+    onset: int,
+    std: float,
+    unknown: dict[int, Floats] | None = None,
 ) -> tuple[Floats, Floats]:
-    """Mean and variance at all places from the joint Gaussian of all readings at intervals of 1 s."""
+    """Mean and variance at all places from the joint Gaussian of all readings at intervals of 1 s.
+
+    unknown: directions of some ticks, (p, k) each, with independent amounts N(0, 1); not part of the mean.
+    """
     at, T = np.arange(model.meters.size), len(m)
     p, n = at.size, model.variance.size
     rho = np.exp(-1.0 / model.time_s)
@@ -50,6 +59,8 @@ def joint(  # noqa: PLR0917  # everything that moves the readings
             V[t, :, s] += std**2 * u[t] * u[s] * G @ G.T
         cross[:, t] = rho ** (T - 1 - t) * model.of_meters + lasts
         cross[:, t] += std**2 * u[t] * effect @ G.T
+    for t, A in (unknown or {}).items():
+        V[t, :, t] += A @ A.T
     cross[:, T - 1] += model.flicker * model.busbar_of @ H.T
     flat = cross.reshape(n, T * p)
     gain = np.linalg.solve(V.reshape(T * p, T * p), flat.T).T
@@ -95,6 +106,62 @@ def test_equals_the_joint_gaussian(fault: str) -> None:
     if made.sign.size <= static.FEW:
         assert np.abs(found.mean - mean).max() <= 1e-9 * np.abs(mean).max()
         assert np.abs(found.variance - variance).max() <= 1e-8 * variance.max()
+
+
+FAULTS = {
+    "meter": (np.eye(5)[:, [2]], None, 0.01),
+    "power": (None, FEEDER.columns(Power.ACTIVE, np.array([3])), 0.05),
+    "busbar": (None, some_meters().busbar_of, 0.01),
+}
+"""Columns at the meters and at all places, and prior standard deviation of the amount."""
+
+
+@pytest.mark.parametrize("fault", ["none", *FAULTS])
+@pytest.mark.parametrize("wide", [0.01, 1.0])
+def test_equals_the_joint_gaussian_beside_unknown_directions(fault: str, wide: float) -> None:
+    """Unknown powers at some ticks and at the last one; a false meter, power, and busbar's meter."""
+    model, onset, random = some_meters(), 4, np.random.default_rng(6)
+    made, n = modes(model), model.variance.size
+    G, effect, std = np.zeros((5, 1)), np.zeros((n, 1)), 0.0
+    if fault != "none":
+        of_meters, of_places, std = FAULTS[fault]
+        effect = effect if of_places is None else of_places
+        G = effect[model.meters] if of_meters is None else of_meters
+    unknown = {k: wide * random.standard_normal((5, 3)) for k in (2, 6, 7, 11)}
+    m = 0.01 * random.standard_normal((12, 5))
+    state, more, since = modal.start(made, 0.0), static.start(made), replay.begun(made, 0, ramp=False)
+    state = replace(state, full=full.expanded(made, state, more))
+    for k, reading in enumerate(m):
+        state, more, update = full.step(
+            made, state, more, float(k), reading, stay=True, unknown=unknown.get(k)
+        )
+        assert update.exact is not None
+        if k >= onset:
+            since = replay.follow(made, since, update.exact, update.gap)
+    prepared = estimate.estimator(made)
+    found = estimate.honest(made, prepared, state, more, m=m[-1])
+    assert found.rest is not None
+    amount = np.zeros(1)
+    if fault != "none":
+        y, F = G.T @ since.score, G.T @ since.information @ G
+        problem = SearchProblem(y, F, np.array([std]), 1, np.zeros(1), np.full(1, np.inf))
+        T = estimate.moves(made, prepared, state, since, G, effect)
+        one = Identification(
+            np.ones((1, 1), bool), np.zeros(1, np.intp), np.ones(1), np.ones(1, bool), (problem,)
+        )
+        found, amount = estimate.corrected([found], [T], one), amounts(problem, np.ones(1, bool))[0]
+    mean, variance = joint(model, m, G, effect, onset, std, unknown)
+    assert np.abs(found.mean - mean).max() <= 1e-9 * np.abs(mean).max()
+    assert np.abs(found.variance - variance).max() <= 1e-8 * variance.max()
+    # The rest by the filter of the readings less the fault.
+    state, more = modal.start(made, 0.0), static.start(made)
+    state = replace(state, full=full.expanded(made, state, more))
+    for k, reading in enumerate(m):
+        less = reading - (G @ amount if k >= onset else 0.0)
+        state, more, _ = full.step(made, state, more, float(k), less, stay=True, unknown=unknown.get(k))
+    assert state.full is not None
+    assert found.rest is not None
+    assert np.abs(found.rest - (less - state.full.mean.sum(axis=0))).max() <= 1e-9
 
 
 def test_a_mixture_contains_the_disagreement() -> None:
