@@ -25,7 +25,8 @@ from feeders.studies.unobservable import CurvePositions
 from gridsec.arrays import Floats
 from gridsec.errors import DesignInfeasible, Problem, raise_if_any
 from gridsec.estimators.front.state import settling_s
-from gridsec.estimators.modal import estimate, monitor, rivals
+from gridsec.estimators.modal import monitor, rivals
+from gridsec.estimators.modal.doubts import Unknown
 from gridsec.estimators.modal.monitor import ModalDesign
 from gridsec.interface import Frame
 from gridsec.planning.collusion import Corridor, furthest
@@ -160,7 +161,7 @@ class Watched:
     """Monitor `modal` of a feeder at the operating point of a study. n places, p meters."""
 
     design: ModalDesign
-    unknown: Floats | None  # (p, k) directions that each frame leaves unknown; None for none
+    unknown: Unknown | None  # directions that each frame leaves unknown; None for none
     model: Floats  # (N,) error of the model at each customer, squared pu
     settling: int  # readings after a start until no frame leaves more unknown: inverters have settled
 
@@ -183,7 +184,7 @@ class Watched:
         """Tests of a step at some ages, within an hour."""
         last = max(1, int(LONGEST_S / self.step_s))
         some = sorted({min(age, last) for age in ages})
-        return step_tests(self.design.core, before, some, self.step_s, unknown=self.unknown, jump=jump)
+        return step_tests(self.design.core, before, some, self.step_s, jump=jump)
 
     def tests(self, steps: tuple[StepTests, ...]) -> MonitorTests:
         """Tests of all ages together."""
@@ -227,16 +228,16 @@ def watched(site: Site, *, share: float = SHARE) -> Watched:
     return Watched(made, unknown, model, settling)
 
 
-def _unknown(made: ModalDesign, frame: Frame, step_s: float) -> Iterator[Floats | None]:
+def _unknown(made: ModalDesign, frame: Frame, step_s: float) -> Iterator[Unknown | None]:
     """Directions that equal frames leave unknown, one after another from the start of the monitor on."""
     state = monitor.init(made, 0.0)
     for k in count():
         state, _, _ = monitor.step(made, state, replace(frame, t=k * step_s))
-        yield state.core.history.unknown
+        yield state.unknown
 
 
-def _directions(unknown: Floats | None) -> int:
-    return 0 if unknown is None else unknown.shape[1]
+def _directions(unknown: Unknown | None) -> int:
+    return 0 if unknown is None else unknown.factor.size
 
 
 def hidden_attack(tests: MonitorTests, watch: Watched, meter: int, liars: int, risk: float) -> Floats:
@@ -267,8 +268,7 @@ class _Given:
         core, few = watch.design.core, watch.known(QUIET)
         steps = watch.steps(few, (1, SINCE))
         (jumped,) = watch.steps(few, (SINCE,), jump=max(rivals.jumps(core.modes)))
-        late = watch.known(QUIET + SINCE)
-        spread = np.sqrt(estimate.honest(core.modes, core.estimator, late.filter, late.static).variance)
+        spread = np.sqrt(watch.known(QUIET + SINCE).variance(core))
 
         def both(steps: tuple[StepTests, ...]) -> tuple[MonitorTests, Mapping[int, Corridor]]:
             tests = watch.tests(steps)

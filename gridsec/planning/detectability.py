@@ -44,6 +44,7 @@ from gridsec.arrays import Floats, Ints, submatrix
 from gridsec.estimators.modal import (
     classes,
     detector,
+    doubts,
     estimate,
     full,
     replay,
@@ -55,6 +56,7 @@ from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal.core import Core, CoreState
 from gridsec.estimators.modal.costs import SearchProblem, Tableau
 from gridsec.estimators.modal.detector import RAMPS, SIZE, WEIGHTS
+from gridsec.estimators.modal.doubts import Unknown
 from gridsec.estimators.modal.filter import FilterState
 from gridsec.estimators.modal.search import DOUBT
 from gridsec.estimators.modal.signatures import Joint, Onsets
@@ -125,14 +127,39 @@ class Known:
     ----------
     filter, static
         The filter, and the information about the directions.
+    unknown
+        Directions that every frame leaves unknown; None for none.
     """
 
     filter: FilterState = field(repr=False)
     static: Static = field(repr=False)
+    unknown: Unknown | None = field(default=None, repr=False)
+
+    @property
+    def wide(self) -> Floats | None:
+        """Unknown directions for the filter, (p, k)."""
+        return None if self.unknown is None else self.unknown.wide
+
+    def regression(self, core: Core) -> Floats:
+        """Regression of the unknown errors at all places on the rest of the residuals, (p, n)."""
+        whole = self.filter.full
+        if self.unknown is None or whole is None:
+            return np.zeros((core.modes.size, len(core.effect)))
+        every = np.arange(core.modes.size)
+        return doubts.regression(core.modes.noise + whole.whole, self.unknown, every)[0]
+
+    def variance(self, core: Core) -> Floats:
+        """Variance of the estimate at all places, (n,), squared pu^2."""
+        out = estimate.honest(core.modes, core.estimator, self.filter, self.static).variance
+        if self.unknown is None:
+            return out
+        cross = self.unknown.meters @ self.unknown.places.T
+        more = (self.unknown.places**2).sum(axis=1) - (self.regression(core) * cross).sum(axis=0)
+        return np.asarray(out + more)
 
 
 def known(
-    core: Core, ticks: int, step_s: float, *, learned_s: float = 0.0, unknown: Floats | None = None
+    core: Core, ticks: int, step_s: float, *, learned_s: float = 0.0, unknown: Unknown | None = None
 ) -> Known:
     """Filter after a number of honest ticks; without any, fixed errors are known by their class only.
 
@@ -144,15 +171,15 @@ def known(
         Number of ticks, and their interval, s.
     learned_s
         Time before them in which fixed errors are learned by `LEARNING` ticks, s; 0 for none.
-    unknown : (p, k)
-        Directions that every frame leaves unknown, as in `gridsec.estimators.modal.core.step`; None for none.
+    unknown
+        Directions that every frame leaves unknown; None for none.
     """
-    made = core.modes
+    made, wide = core.modes, None if unknown is None else unknown.wide
     state, info, zero = modal.start(made, 0.0), static.start(made), np.zeros(made.size)
     intervals = [learned_s / LEARNING] * (LEARNING if learned_s > 0.0 else 0) + [step_s] * ticks
     for h in intervals:
-        state, info, _ = full.step(made, state, info, state.t + h, zero, stay=True, unknown=unknown)
-    return Known(state, info)
+        state, info, _ = full.step(made, state, info, state.t + h, zero, stay=True, unknown=wide)
+    return Known(state, info, unknown)
 
 
 # --- Tests of one age ---
@@ -201,7 +228,6 @@ def step_tests(
     ages: Sequence[int],
     step_s: float,
     *,
-    unknown: Floats | None = None,
     jump: float = 0.0,
 ) -> tuple[StepTests, ...]:
     """Tests of a step at some ages; O(p^2) per tick, and O(p^3) with unknown directions.
@@ -214,8 +240,6 @@ def step_tests(
         Ticks since the onset, growing.
     step_s
         Interval of the ticks, s.
-    unknown
-        As in `known`.
     jump
         Variance of a jump of the loads at the onset, in that of the loads, 1.
     """
@@ -232,7 +256,7 @@ def step_tests(
             begun + n * step_s,
             zero,
             stay=True,
-            unknown=unknown,
+            unknown=before.wide,
             jump=jump if first else 0.0,
         )
         onsets = signatures.follow(made, onsets, update, info, update.gap.h, begun=[0] if first else ())
@@ -240,7 +264,7 @@ def step_tests(
             exact = replay.follow(made, exact, update.exact, update.gap)
         if n in ages:
             joint = signatures.joint(made, onsets, info, 0) if update.exact is None else exact.joint(made)
-            out.append(_tests(core, Known(state, info), onsets, 0, joint, capital))
+            out.append(_tests(core, Known(state, info, before.unknown), onsets, 0, joint, capital))
     return tuple(out)
 
 
@@ -278,7 +302,12 @@ def _tests(  # noqa: PLR0917  # the core, and one onset
     rows = scores, *_class_rows(core, now, joint)
     quadratic, offset = _omnibus(told, SIZE**2 / made.white)
     half = np.linalg.cholesky(quadratic).T @ scored / sqrt(2.0 * left[1] + offset)
-    still = np.zeros((len(core.effect), p))
+    n = len(core.effect)
+    # What corrects the estimate, and what then moves the unknown errors.
+    moved = estimate.moves(made, core.estimator, now.filter, joint, np.eye(p), np.zeros((n, p)))
+    weights = -moved[:n]
+    if now.unknown is not None:
+        weights = weights - now.regression(core).T @ moved[n:]
     limits = np.concatenate([members, others, rows[2]])
     counted = np.isfinite(limits)
     return StepTests(
@@ -289,8 +318,7 @@ def _tests(  # noqa: PLR0917  # the core, and one onset
         noise=np.concatenate([noise, rows[3]])[counted],
         bias=np.concatenate([np.zeros(noise.size), rows[4]])[counted],
         form=half,
-        # `moves` is what corrects the estimate.
-        weights=-estimate.moves(made, core.estimator, now.filter, joint, np.eye(p), still),
+        weights=weights,
     )
 
 

@@ -47,7 +47,7 @@ from math import exp, sqrt
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from gridsec.arrays import Bools, Floats, all_of, any_of, indices
+from gridsec.arrays import Bools, Floats, Ints, all_of, any_of, indices, submatrix
 from gridsec.estimators.front.design import FrontDesign
 from gridsec.estimators.front.measurements import (
     COMMON_SHARE,
@@ -391,11 +391,27 @@ def estimated(
 
 def _regressed(noise: Floats, given: Unknown, u: Floats, seen: Bools) -> tuple[Floats, Floats]:
     """Regression on the meters `seen` (p,)."""
-    n, A = indices(seen), given.meters
-    variance = (given.places**2).sum(axis=1)
-    if not n.size:
-        return np.zeros(variance.size), variance
-    factor = cho_factor(noise[np.ix_(n, n)] + A[n] @ A[n].T)
-    cross = A[n] @ given.places.T
-    gain = cho_solve(factor, cross)
+    n, variance = indices(seen), (given.places**2).sum(axis=1)
+    gain, cross = regression(noise, given, n)
     return gain.T @ u[n], np.maximum(variance - (gain * cross).sum(axis=0), 0.0)
+
+
+def regression(noise: Floats, given: Unknown, n: Ints) -> tuple[Floats, Floats]:
+    """Regression ``(A_n A_n' + D_n)^-1 A_n A_x'`` of the unknown errors at all places x, and ``A_n A_x'``.
+
+    Parameters
+    ----------
+    noise, given
+        As in `estimated`.
+    n : (k,)
+        Meters with a reading in use.
+
+    Returns
+    -------
+    (k, n) each
+    """
+    A = given.meters[n]
+    cross = A @ given.places.T
+    if not n.size:
+        return cross, cross
+    return cho_solve(cho_factor(submatrix(noise, n, n) + A @ A.T), cross), cross

@@ -193,6 +193,8 @@ class ModalState:
         Readings by the filter after the last tick.
     movements
         Movements of the powers up to the last frame; None before the first.
+    unknown
+        Directions that the last frame left unknown.
     """
 
     front: FrontState
@@ -208,6 +210,7 @@ class ModalState:
     injections: InjectionError
     fit: drive.Fit
     movements: Movements | None = None
+    unknown: Unknown | None = field(default=None, repr=False)
 
     @property
     def attack_kinds(self) -> AttackKinds:
@@ -564,6 +567,7 @@ def _answered(design: ModalDesign, state: ModalState, tick: _Tick) -> tuple[Moda
         kept=kept or state.kept,
         held=tick.held,
         injections=injections,
+        unknown=tick.unknown,
         fit=drive.fitted(design.core, kernel, state.fit, now.ticks, None if state.suspicion else mean),
     )
     return (out if learning is None else _learned(design, out)), estimate, answer
@@ -637,20 +641,13 @@ def _estimate(
         powers=powers if powers.trusted is now.trust.trusted else changed(powers, trusted=now.trust.trusted),
         injected=tick.predicted.injection_error.error,
         model=tick.predicted.v2_bus[plant.feeder.bus],
-        busbar=_bounding(design, state, metered),
+        busbar=verdict.bounding(kernel, state.core, state.suspicion, metered),
         y=measured.y,
         trusted=sure,
         checked=partial(checked, front, measured.frame),
         sigmas=front.sigmas,
     )
     return Reconstructed.later(inputs, measured.frame.t, v2_bus, spread, tick.predicted.x), spread
-
-
-def _bounding(design: ModalDesign, state: ModalState, metered: Bools | bool) -> Bools | bool:
-    """Phases of the busbar with a reading that bounds the voltages: none that may be manipulated."""
-    if state.suspicion is not None:
-        return np.asarray(metered & ~verdict.accused_phases(design.core, state.suspicion))
-    return metered if not any_of(state.core.detector.pinned) else np.zeros_like(metered)
 
 
 def own_errors(design: ModalDesign, state: CoreState) -> Floats:

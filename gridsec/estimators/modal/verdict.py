@@ -352,13 +352,25 @@ def accused(core: Core, suspicion: Suspicion) -> Bools:
     return np.asarray(found.chosen[found.weight >= LIKELY, : core.modes.size].any(axis=0))
 
 
-def accused_phases(core: Core, suspicion: Suspicion) -> Bools:
-    """Phases of the busbar with a meter that a likely explanation accuses, (b,); b counts all phases."""
+def bounding(
+    core: Core, state: CoreState, suspicion: Suspicion | None, metered: Bools | bool
+) -> Bools | bool:
+    """Phases of the busbar with a reading that bounds the voltages, (b,): none that may be manipulated.
+
+    Parameters
+    ----------
+    core, state, suspicion
+        The core, the state after a tick, and the explanations, if there are any.
+    metered : (b,)
+        Phases with a reading in use.
+    """
+    if suspicion is None:
+        return np.zeros_like(metered) if any_of(state.detector.pinned) else metered
     found, first = suspicion.found, core.modes.size + core.faults.powers
     some = core.modes.model.phases(core.modes.at).any(axis=0)
     out = np.zeros(some.size, dtype=np.bool_)
     out[some] = found.chosen[found.weight >= LIKELY, first:].any(axis=0)
-    return out
+    return np.asarray(metered & ~out)
 
 
 def certain_phases(core: Core, suspicion: Suspicion) -> Bools:

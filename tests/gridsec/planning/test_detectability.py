@@ -12,9 +12,10 @@ from scipy.optimize import linprog
 
 from gridsec.arrays import Bools, Floats
 from gridsec.estimators.front.posterior import LoadDoubt
-from gridsec.estimators.modal import classes, core, monitor, rivals, signatures
+from gridsec.estimators.modal import classes, core, doubts, estimate, full, monitor, rivals, signatures
 from gridsec.estimators.modal.core import Core, CoreState
 from gridsec.estimators.modal.costs import SearchProblem, cost
+from gridsec.estimators.modal.doubts import WIDER, Unknown
 from gridsec.estimators.modal.search import DOUBT
 from gridsec.estimators.plant import Plant
 from gridsec.grid.devices import MeterAccuracy, fleet
@@ -103,13 +104,40 @@ def test_information_of_a_step_is_that_of_dense_covariances(seed: int, apart: bo
 @pytest.mark.parametrize("seed", range(3))
 def test_information_with_unknown_directions_is_that_of_dense_covariances(seed: int) -> None:
     kernel, rng = made(seed), np.random.default_rng(seed)
-    unknown = 0.01 * rng.standard_normal((METERS, 2))
+    unknown = unknown_directions(kernel, rng)
     ticks = QUIET + SINCE
-    V = covariance(kernel, ticks) + np.kron(np.eye(ticks), unknown @ unknown.T)
+    V = covariance(kernel, ticks) + np.kron(np.eye(ticks), unknown.wide @ unknown.wide.T)
     X = np.kron((np.arange(ticks) >= QUIET)[:, None], np.eye(METERS))
     before = known(kernel, QUIET, 1.0, unknown=unknown)
-    (tests,) = step_tests(kernel, before, (SINCE,), 1.0, unknown=unknown)
+    (tests,) = step_tests(kernel, before, (SINCE,), 1.0)
     np.testing.assert_allclose(tests.information, X.T @ np.linalg.solve(V, X), rtol=1e-6)
+
+
+def unknown_directions(kernel: Core, random: np.random.Generator) -> Unknown:
+    """Two unknown directions at all places."""
+    places = 0.003 * random.standard_normal((kernel.effect.shape[0], 2))
+    meters = places[kernel.model.meters]
+    return Unknown(places, meters, np.full(2, WIDER), np.zeros(METERS, np.bool_), 2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_weights_beside_unknown_directions_are_the_change_of_the_estimate(seed: int) -> None:
+    """Oracle: the filter and the unknown errors by its last tick, of readings with and without a step."""
+    kernel, random = made(seed), np.random.default_rng(seed)
+    unknown, modes = unknown_directions(kernel, random), kernel.modes
+    before = known(kernel, QUIET, 1.0, unknown=unknown)
+    (tests,) = step_tests(kernel, before, (SINCE,), 1.0)
+    step = random.standard_normal(METERS)
+    after, info = before.filter, before.static
+    for _ in range(SINCE):
+        after, info, _ = full.step(modes, after, info, after.t + 1.0, step, stay=True, unknown=unknown.wide)
+    found, whole = estimate.honest(modes, kernel.estimator, after, info, m=step), after.full
+    assert whole is not None
+    assert found.rest is not None
+    off, variance = doubts.estimated(modes.noise + whole.whole, unknown, found.rest, whole.seen)
+    np.testing.assert_allclose(tests.weights @ step, found.mean + off, rtol=1e-6, atol=1e-9)
+    late = Known(after, info, unknown)
+    np.testing.assert_allclose(late.variance(kernel), found.variance + variance, rtol=1e-9)
 
 
 @pytest.mark.parametrize("onset", [0, QUIET])

@@ -40,6 +40,15 @@ def test_a_third_that_drifts_is_named(seed: int) -> None:
     assert sorted(one.named) == sorted(one.manipulated)
 
 
+@pytest.mark.parametrize("seed", [19, 39])
+def test_voltages_are_within_their_deviations_beside_late_powers(seed: int) -> None:
+    """A false busbar's meter moves the residuals of all meters, also along directions that are unknown."""
+    one = run("busbar-balanced", seed, model=Model.LATE)
+    assert one.decisions[Decision.ATTACKED] > 80
+    assert one.ratio < 4.0
+    assert one.bound < 1.0
+
+
 def test_a_run_is_its_situation_and_seed() -> None:
     def told(one: Run) -> tuple[object, ...]:
         return one.cell, one.decisions, one.manipulated, one.named, one.accused, one.ratio, one.clean_volt

@@ -11,6 +11,7 @@ import pytest
 from gridsec.estimators.front import LoadDoubt
 from gridsec.estimators.modal import monitor
 from gridsec.estimators.modal.monitor import ModalDesign
+from gridsec.estimators.plant import NO_VOLTAGE
 from gridsec.interface import Cause, Decision, Frame
 from tests.gridsec.estimators.modal.streets import Answers, prepare, watch
 from tests.gridsec.estimators.modal.test_phases import apart
@@ -66,6 +67,16 @@ class TestStreets:
         assert answers[-1][1].decision is Decision.CLEAN
         assert not answers[-1][1].busbar.any()
         assert state.front.busbar.trusted.all()
+
+    def test_a_suspected_meter_bounds_no_voltage(self) -> None:
+        """A bound by a false busbar voltage does not contain the truth; other readings bound none either."""
+        road, design = make(1)
+        state, answers = watch(road, design, 30)
+        assert answers[-1][0].bound.max() < 0.1
+        _, answers = watch(road, design, 3, state=state, change=reads(0.03))
+        open_ = [estimate for estimate, verdict in answers if verdict.decision is Decision.UNDECIDED]
+        assert open_
+        assert all((estimate.bound == NO_VOLTAGE).all() for estimate in open_)
 
     def test_beside_as_many_liars_as_can_be_told_apart(self) -> None:
         road, design = make(3)
