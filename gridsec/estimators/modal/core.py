@@ -52,7 +52,7 @@ from gridsec.estimators.modal.model import Modes, ResidualModel, modes, residual
 from gridsec.estimators.modal.replay import History, Parts, Suspected
 from gridsec.estimators.modal.rivals import Rival
 from gridsec.estimators.modal.search import DOUBT, Identification, search
-from gridsec.estimators.modal.signatures import Columns, Joint, Scored
+from gridsec.estimators.modal.signatures import Columns, Joint, Onsets, Scored
 from gridsec.estimators.modal.static import Static
 from gridsec.grid.network import Power
 
@@ -72,13 +72,6 @@ EXPLAINED = 0.25
 """Share of the misfit since the onset from which on the best explanation counts as one, 1.
 
 A lasting fault explains all of it, one that grows since the onset three quarters, and alternating ones none.
-"""
-SETTLED = 0.9
-"""Share from which on no transition is looked for, and below which sets beside one name nothing, 1."""
-OFTEN = 0.3
-"""Share of the last ticks with a jump of the loads from which on jumps explain everything, and so nothing, 1.
-
-Three ticks in turn have it. With kettles in 57 households, and no report of any, it is 0.2.
 """
 ADOPTED = 0.05
 """Largest weight of sets that need a meter where loads are adopted, 1: a meter may hide its own load."""
@@ -164,6 +157,9 @@ class CoreState:
         Variance of the loads' errors, in that of the model, 1: more after a jump.
     spell
         Ticks in turn with a pinned onset.
+    began
+        Time of the first reading of the earliest pinned onset; infinite for none. Without a pinned onset it
+        is given up with that reading.
     """
 
     filter: FilterState
@@ -177,6 +173,12 @@ class CoreState:
     beyond: Bools | None = None
     loads: float = 1.0
     spell: int = 0
+    began: float = inf
+
+    @property
+    def first(self) -> int:
+        """Number of the first kept reading of the earliest pinned onset."""
+        return sum(each[0] < self.began for each in self.history.readings)
 
     @property
     def exceeding(self) -> Bools:
@@ -340,11 +342,13 @@ def step(  # noqa: PLR0917  # the state, and one tick
         if pinned and not suspected:
             suspected = replay.carried(made, state.detector.onsets, state.static, pinned)
         suspected = tuple(replay.follow(made, each, update.exact, update.gap) for each in suspected)
-    others = tuple(rivals.followed(state.rivals, t, m, seen, unknown, jump))
+    others, began = tuple(rivals.followed(state.rivals, t, m, seen, unknown, jump)), state.began
     if evidence.log_m >= core.limit and (not pinned or _elsewhere(state, evidence, test, others)):
-        test = detector.pin(test, evidence.rows)
+        likeliest, age = int(evidence.rows[0]), len(state.history.readings) + 1 - state.first
+        test = detector.pin(test, _pins(test.onsets, evidence.rows, age))
         last = replay.record(state.history, (after, known, test, ()), m, seen, unknown, jump)
-        others = rivals.replayed(made, core.rivals, last, test.onsets, int(evidence.rows[0]))
+        began = min(began, last.readings[-int(test.onsets.age[likeliest]) :][0][0])
+        others = rivals.replayed(made, core.rivals, last, test.onsets, likeliest)
         if update.exact is not None:
             rows = np.flatnonzero(test.pinned).tolist()
             suspected = replay.replayed(made, last, test.onsets, rows)
@@ -353,15 +357,28 @@ def step(  # noqa: PLR0917  # the state, and one tick
     history = replay.record(state.history, (after, known, test, suspected), m, seen, unknown, jump)
     loads = update.gap.varied(made, state.loads)
     spell = state.spell + 1 if pinned else 0
-    now = CoreState(after, known, test, update, history, suspected, masked, others, beyond, loads, spell)
-    return now, evidence
+    if began < history.readings[0][0] and not any_of(test.pinned):
+        began = inf
+    parts = after, known, test, update, history, suspected, masked, others, beyond, loads, spell, began
+    return CoreState(*parts), evidence
+
+
+def _pins(onsets: Onsets, rows: Ints, age: int) -> Ints:
+    """Rows to pin: the likeliest ones, and the ramp with about the age of the earliest pinned onset."""
+    ramps = np.flatnonzero(onsets.used & onsets.ramp)
+    if not ramps.size or age <= onsets.age[rows].max():
+        return rows
+    return np.concatenate([rows[:-1], ramps[[np.abs(onsets.age[ramps] - age).argmin()]]])
 
 
 def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState, Evidence]:
-    """Mask the named meters from the onset on, by replaying the kept readings without theirs.
+    """Mask the named meters from the earliest pinned onset on, by replaying the kept readings without theirs.
 
-    Evidence against other meters stays: it is collected anew. Where the onset is older than the kept
-    readings, the filter before them is freed of the faults, and all onsets begin with them.
+    The onset that explains a drift best is late. False readings before it, which the filter has learned as
+    errors of loads, speak against honest meters and for those that are not named yet. Meters that are masked
+    already are unread from there on, too. Evidence against others stays: it is collected anew. Where the
+    onset is older than the kept readings, the filter before them is freed of the faults, and all onsets begin
+    with them.
 
     Parameters
     ----------
@@ -371,9 +388,11 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
         The explanations after the same tick.
     """
     named, history = suspicion.found.named, state.history
-    first = len(history.readings) - int(state.detector.onsets.age[suspicion.row])
-    begun = None
-    if first < 0:
+    used = ~(named | state.masked.meters)
+    first, begun = len(history.readings) - int(state.detector.onsets.age[suspicion.row]), None
+    if first >= 0:
+        first = min(first, state.first)
+    else:
         before, known, *_ = history.start
         joint = _joint(core, history.start, suspicion.row)
         whole = before.full or full.expanded(core.modes, before, known)
@@ -381,7 +400,7 @@ def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState,
         begun = replace(before, full=replay.freed(core.modes, whole, joint, W, np.ones(W.shape[1])))
 
     def masked(k: int, seen: Bools | None, unknown: Floats | None) -> tuple[Bools | None, Floats | None]:
-        return seen if k < first else ~named if seen is None else seen & ~named, unknown
+        return seen if k < first else used if seen is None else seen & used, unknown
 
     now, evidence = again(core, state, first, masked, begun)
     amount = amounts(core, state, suspicion)[: named.size]
@@ -445,7 +464,7 @@ def again(
         t, m, seen, unknown, jump = history.readings[k]
         now, evidence = step(core, now, t, m, *change(k, seen, unknown), jump)
     # The loads have varied once.
-    return replace(now, loads=state.loads), evidence
+    return replace(now, loads=state.loads, began=min(now.began, state.began)), evidence
 
 
 def beside_unknown(
@@ -632,53 +651,15 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     age = int(test.onsets.age[rows[best]])
     found = mirrors.reflected(found, core.near, state.masked.meters)
     replacing = () if before is None else before.replacing
-    left = _left(state, found, age)
+    left = rivals.left(state.rivals, found, age)
     unread = unknown is not None and unknown.shape[1] >= UNREAD * core.modes.size
     weighed = collusion.weighed(found, state.masked.meters, core.near, left, replacing, unread=unread)
     sets = {each.tobytes(): each for each in (*weighed.replacing, *replacing)}
     found, replacing = weighed.found, tuple(sets.values())[:RECALLED]
-    share = _explained(state, found, age)
+    share = rivals.explained(state.rivals, found, age)
     fits = share >= EXPLAINED and not (age >= test.ticks and _aligned(core, found))
     found = found if fits else replace(found, named=np.zeros_like(found.named))
-    return Suspicion(rows[best], found, weighed.contested, fits, fits and share >= SETTLED, replacing)
-
-
-def _explained(state: CoreState, found: Identification, age: int) -> float:
-    """Share of the misfit beyond chance that the best explanation takes away.
-
-    The model is that of the loads, a steady rival, or from `SETTLED` on a transition.
-    """
-    best = 0.0 if state.rivals else 1.0
-    for at in dict.fromkeys((0, int((found.model == 0).argmax()))) if state.rivals else ():
-        model = state.rivals[int(found.model[at])]
-        if model.transition and not any_of(found.chosen[at]):
-            continue
-        beyond = model.misfit - model.chance
-        share = _gain(found, at, model, age) / beyond if beyond > 0.0 else 1.0
-        if model.transition and share < SETTLED:
-            # The names are those of its sets.
-            return 0.0
-        if not found.model[at] or model.unsteady < OFTEN:
-            best = max(best, share)
-    return best
-
-
-def _left(state: CoreState, found: Identification, age: int) -> float:
-    """Largest share of the misfit that the best explanation may leave: that which it leaves, and chance."""
-    if not state.rivals:
-        return inf
-    model = state.rivals[int(found.model[0])]
-    left = model.misfit + model.chance - _gain(found, 0, model, age)
-    return max(left, 0.0) / model.misfit if model.misfit > 0.0 else inf
-
-
-def _gain(found: Identification, at: int, model: Rival, age: int) -> float:
-    """Twice the logarithm of the likelihood's gain by an explanation, at its mean amounts.
-
-    Of an onset before the kept readings, a gain in proportion to their number.
-    """
-    problem, chosen = found.problems[int(found.model[at])], found.chosen[at]
-    return float(problem.y[chosen] @ mean_amounts(problem, chosen)) * min(1.0, model.ticks / age)
+    return Suspicion(rows[best], found, weighed.contested, fits, fits and share >= rivals.SETTLED, replacing)
 
 
 def _aligned(core: Core, found: Identification) -> bool:

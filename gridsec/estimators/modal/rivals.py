@@ -33,19 +33,21 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from math import log, sqrt
+from math import inf, log, sqrt
 from typing import Any
 
 import numpy as np
 from scipy.linalg import lapack
 
-from gridsec.arrays import Bools, Floats, all_of, indices, submatrix
+from gridsec.arrays import Bools, Floats, all_of, any_of, indices, submatrix
 from gridsec.estimators.modal import detector, replay, signatures
 from gridsec.estimators.modal import filter as modal
 from gridsec.estimators.modal import full as exact
+from gridsec.estimators.modal.costs import mean_amounts
 from gridsec.estimators.modal.filter import FilterState, Interval, Update
 from gridsec.estimators.modal.model import REPORTED_S, Modes
 from gridsec.estimators.modal.replay import History, Reading, Suspected
+from gridsec.estimators.modal.search import Identification
 from gridsec.estimators.modal.signatures import Joint, Onsets, Scored
 from gridsec.estimators.modal.static import Static
 
@@ -62,6 +64,16 @@ RECENT = 8.0
 """Memory of the share of ticks with a jump, ticks."""
 BY_CHANCE = 3.0
 """Misfit that needs no explanation, in standard deviations of n honest innovations, ``sqrt(2 n)``, 1."""
+SETTLED = 0.9
+"""Share of the misfit from which on an explanation leaves no transition to look for, 1.
+
+Below it, sets beside a transition name nothing.
+"""
+OFTEN = 0.3
+"""Share of the last ticks with a jump of the loads from which on jumps explain everything, and so nothing, 1.
+
+Three ticks in turn have it. With kettles in 57 households, and no report of any, it is 0.2.
+"""
 APART = 0.05
 """Standard deviation of a reading within a transition, squared pu: manipulations of several percent."""
 RATE = 1.0 / 60.0
@@ -448,3 +460,57 @@ def _jumped(modes: Modes, state: FilterState, gap: Interval, size: float) -> Fil
         w, both, b = full.blocks
         full = replace(full, blocks=(w + more * modes.jumps, both, b))
     return replace(state, cov=cov, full=full)
+
+
+# --- Explanations ---
+
+
+def explained(models: Sequence[Rival], found: Identification, age: int) -> float:
+    """Share of the misfit beyond chance that the best explanation takes away, 1.
+
+    The model is that of the loads, a steady rival, or from `SETTLED` on a transition.
+
+    Parameters
+    ----------
+    models
+        The model and its rivals; none: all of it.
+    found, age
+        The explanations, and the age of their onset, ticks.
+    """
+    best = 0.0 if models else 1.0
+    for at in dict.fromkeys((0, int((found.model == 0).argmax()))) if models else ():
+        model = models[int(found.model[at])]
+        if model.transition and not any_of(found.chosen[at]):
+            continue
+        beyond = model.misfit - model.chance
+        share = _gain(found, at, model, age) / beyond if beyond > 0.0 else 1.0
+        if model.transition and share < SETTLED:
+            # The names are those of its sets.
+            return 0.0
+        if not found.model[at] or model.unsteady < OFTEN:
+            best = max(best, share)
+    return best
+
+
+def left(models: Sequence[Rival], found: Identification, age: int) -> float:
+    """Largest share of the misfit that the best explanation may leave: that which it leaves, and chance.
+
+    Parameters
+    ----------
+    models, found, age
+        As in `explained`.
+    """
+    if not models:
+        return inf
+    model = models[int(found.model[0])]
+    rest = model.misfit + model.chance - _gain(found, 0, model, age)
+    return max(rest, 0.0) / model.misfit if model.misfit > 0.0 else inf
+
+
+def _gain(found: Identification, at: int, model: Rival, age: int) -> float:
+    """Twice the logarithm of the likelihood's gain by an explanation, at its mean amounts.
+
+    Of an onset before the kept readings, a gain in proportion to their number.
+    """
+    problem, chosen = found.problems[int(found.model[at])], found.chosen[at]
+    return float(problem.y[chosen] @ mean_amounts(problem, chosen)) * min(1.0, model.ticks / age)

@@ -92,6 +92,52 @@ def test_the_amount_of_a_ramp_is_that_of_the_reading(kernel: Core) -> None:
     assert 0.5 * lie < state.masked.amount[FIRST] < 2.0 * lie
 
 
+def test_meters_are_masked_from_the_earliest_suspected_onset_on(kernel: Core) -> None:
+    """Two drifts. The earliest onset counts for each meter; without a suspicion it is kept with its reading."""
+    source, state, earliest = Source(MODEL, np.random.default_rng(1)), core.init(kernel, 0.0), np.inf
+    both, first = np.isin(np.arange(12), [FIRST, SECOND]), None
+    for k in range(420):
+        lie = 1e-4 * min(max(0, k - 200), 120)
+        state, evidence = core.step(kernel, state, float(k), source.tick() + lie * both)
+        pinned = state.detector.pinned
+        if pinned.any() and first is None:
+            first = state.began
+            assert 190.0 <= first <= k
+        assert state.began <= earliest or not pinned.any()
+        earliest = state.began
+        if core.alarmed(kernel, evidence):
+            suspicion = core.identify(kernel, state, evidence)
+            if suspicion.found.named.any():
+                # As if a pinned onset before had been older.
+                state, evidence = core.mask(kernel, replace(state, began=first - 7.0), suspicion)
+                since = [seen for t, _, seen, *_ in state.history.readings if t >= first - 7.0]
+                before = [seen for t, _, seen, *_ in state.history.readings if t < first - 7.0]
+                assert not any(seen[state.masked.meters].any() for seen in since)
+                assert all(seen is None for seen in before)
+                earliest = state.began
+                assert earliest == first - 7.0
+    assert np.array_equal(state.masked.meters, both)
+    for k in range(420, 420 + 2 * replay.HALF):
+        state, _ = core.step(kernel, state, float(k), source.tick() + lie * both)
+    assert state.began == np.inf
+    assert state.first == len(state.history.readings)
+
+
+def test_a_long_suspected_ramp_stays_a_candidate(kernel: Core) -> None:
+    """Its onset is pinned beside the likeliest ones, where these are younger."""
+    source, state = Source(MODEL, np.random.default_rng(1)), core.init(kernel, 0.0)
+    for k in range(100):
+        state, evidence = core.step(kernel, state, float(k), source.tick())
+    onsets, rows = state.detector.onsets, np.flatnonzero(state.detector.onsets.used)
+    young = rows[np.argsort(onsets.age[rows])][: evidence.rows.size]
+    pins = core._pins(onsets, young, 70)
+    assert pins[:-1].tolist() == young[:-1].tolist()
+    ramps = rows[onsets.ramp[rows]]
+    assert onsets.ramp[pins[-1]]
+    assert abs(onsets.age[pins[-1]] - 70) == np.abs(onsets.age[ramps] - 70).min()
+    assert core._pins(onsets, young, 1) is young
+
+
 def test_a_single_reading_replaces_no_smaller_amount(kernel: Core) -> None:
     """A lie within a wide deviation, and one reading at 20 times the lie; repeated readings keep it."""
     p, meter = kernel.modes.size, np.eye(12)[FIRST]
