@@ -93,7 +93,7 @@ def test_the_amount_of_a_ramp_is_that_of_the_reading(kernel: Core) -> None:
 
 
 def test_meters_are_masked_from_the_earliest_suspected_onset_on(kernel: Core) -> None:
-    """Two drifts. The earliest onset counts for each meter; without a suspicion it is kept with its reading."""
+    """Two drifts. The earliest onset counts for each meter, and is kept as long as its reading."""
     source, state, earliest = Source(MODEL, np.random.default_rng(1)), core.init(kernel, 0.0), np.inf
     both, first = np.isin(np.arange(12), [FIRST, SECOND]), None
     for k in range(420):
