@@ -397,7 +397,9 @@ def _named(
     due, earlier = tick + wait, suspicion.earlier(state.suspicion)
     after = replace(state, suspicion=suspicion, streak=streak, phases=phases, inverters=inverters, due=due)
     since = () if any_of(masked) else state.core.history.readings[-age:]
-    sure = final(suspicion.found, earlier, named, streak, since, kernel.near.laterals)
+    sure = final(
+        suspicion.found, earlier, named, streak, since, kernel.near.laterals, settled=suspicion.settled
+    )
     if suspicion.fits and not any_of(sure):
         # Masked meters alone may have been manipulated before they were masked.
         sure = alone(suspicion.found, masked)

@@ -1,6 +1,6 @@
 """Final names: meters that searches in turn accuse, masked together or where nothing depends on it.
 
-    final(found, before, named, streak, since, laterals) -> (p,)      meters to mask
+    final(found, before, named, streak, since, laterals, settled) -> (p,)      meters to mask
     unseen(design, effect, most, lead, off) -> bool           steps by other clocks may explain them
 
 A search names the meters without which nothing explains the readings. The first explanation of several faults
@@ -60,17 +60,19 @@ def final(  # noqa: PLR0917  # two searches, and the counts of both
     streak: Ints,
     since: Sequence[Reading],
     laterals: Bools,
+    *,
+    settled: bool = True,
 ) -> Bools:
     """Meters to mask now, (p,).
 
     Parameters
     ----------
-    found, before, named, streak, since
+    found, before, named, streak, since, settled
         As in `confirmed`.
     laterals : (G, p)
         Members of the laterals that may be manipulated as a whole.
     """
-    sure = confirmed(found, before, named, streak, since)
+    sure = confirmed(found, before, named, streak, since, settled=settled)
     if not any_of(sure) or streak[sure].max() >= WHOLE or separable(found, sure, laterals):
         return sure
     return np.zeros_like(sure)
@@ -82,6 +84,8 @@ def confirmed(
     named: Bools,
     streak: Ints,
     since: Sequence[Reading],
+    *,
+    settled: bool = True,
 ) -> Bools:
     """Meters that a search names finally, (p,).
 
@@ -97,14 +101,17 @@ def confirmed(
         Searches in turn with each in the likeliest explanation, and replaced by no others.
     since
         Ticks since the suspected onset; none where meters are masked, and may collude with others.
+    settled
+        The likeliest explanation takes nearly all of the misfit away.
     """
     sole = any_of(named) and np.count_nonzero(found.chosen[0]) == 1
     readings = sum(seen is None or all_of(seen[named]) for _, _, seen, *_ in since)
     passing = sole and before is not None and readings <= SEVERAL and _over(found, before, readings)
     if sole and not passing and readings >= CONFIRM:
         return named
-    # Without a part of the meters, other faults may explain the rest: a few more searches may name all.
-    least = CONFIRM if all_of(streak[named] >= CONFIRM) and not passing else SEVERAL
+    # Without a part of the meters, other faults may explain the rest, and so may what is not found yet: a few
+    # more searches may name all.
+    least = CONFIRM if settled and all_of(streak[named] >= CONFIRM) and not passing else SEVERAL
     return np.asarray(named & (streak >= least))
 
 
