@@ -195,7 +195,7 @@ def _tableaus(
         if not which.any():
             continue
         base, rows, differ = Tableau(problem, *borders).pivot(own), np.flatnonzero(which), sets[which] ^ own
-        doubles = np.ceil(np.log2(np.maximum(np.count_nonzero(differ, axis=1), 1)))
+        doubles = np.ceil(np.log2(np.maximum(np.count_nonzero(differ, axis=1), SMALL)))
         for each in np.unique(doubles):
             yield base, rows[doubles == each], *padded(differ[doubles == each])
 
@@ -291,6 +291,8 @@ TOGGLED = 16
 """Faults in which a set differs from another one up to which its cost is that of a few toggles, 1."""
 FEW = 8
 """Number of sets up to which each has a factor of its own, 1: a tableau takes ten times as long as one."""
+SMALL = 8
+"""Number of faults up to which sets come together, 1: the calls take longer than the products."""
 ROOM = 16
 """Columns of a tableau that are free for more faults, 1."""
 _HUGE = 1e200

@@ -196,11 +196,19 @@ class _Likelihood:
         few, every = among(problem, chosen), np.ones(int(np.count_nonzero(chosen)), dtype=np.bool_)
         starts = {share: Alike(few, share) if share else Tableau(few) for share in self.shares}
         self.tableaus = {share: start.pivot(every) for share, start in starts.items()}
-        own = self._each(chosen[None], np.zeros((1, problem.meters), dtype=np.bool_))
+        own = np.array([self._whole(share) for share in self.shares])
         # A prior that is far worse for the set is so for its images.
-        least = own.min() + APART
-        self.shares = tuple(share for share, one in zip(self.shares, own, strict=True) if one[0] <= least)
-        self.own = float(mean_likelihood(own[own[:, 0] <= least])[0])
+        likely = own <= own.min() + APART
+        self.shares = tuple(np.array(self.shares)[likely].tolist())
+        self.own = float(mean_likelihood(own[likely]))
+
+    def _whole(self, share: float) -> float:
+        """L of the set."""
+        tableau = self.tableaus[share]
+        out = tableau.whole - float(tableau.penalty[tableau.count] + tableau.problem.charge.sum())
+        if isinstance(tableau, Alike):
+            out += float(self.problem.charge.max(initial=0.0)) - tableau.charge
+        return out
 
     def __call__(self, rest: Bools, columns: Bools) -> Floats:
         """L of faults `rest` (n, q) and of meters `columns` (n, p) with one amount, (n,)."""
