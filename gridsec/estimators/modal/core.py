@@ -649,7 +649,7 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     if best:
         found = _searched(core, state, _problem(core, scored[rows[best]], unknown), known)
     age = int(test.onsets.age[rows[best]])
-    found = mirrors.reflected(found, core.near, state.masked.meters)
+    found = mirrors.reflected(found, core.near, state.masked.meters, known)
     replacing = () if before is None else before.replacing
     left = rivals.left(state.rivals, found, age)
     unread = unknown is not None and unknown.shape[1] >= UNREAD * core.modes.size

@@ -46,6 +46,8 @@ from gridsec.estimators.modal.search import ALIKE, Identification, costs_of, ext
 
 REFLECTED = 0.01
 """Weight from which on an explanation has mirror images, 1: that of reported explanations."""
+STAYS = 0.003
+"""The same for sets of an earlier search, 1: an image does not vanish where its set loses some weight."""
 APART = 20.0
 """Cost of one amount in place of several from which on meters are not off alike, 1."""
 
@@ -82,8 +84,10 @@ def neighbourhoods(modes: Modes, most: int, customers: Ints | None = None) -> Ne
     return Neighbourhoods(laterals, modes.phases > 0.0, most, modes.size + customers)
 
 
-def reflected(found: Identification, near: Neighbourhoods, masked: Bools) -> Identification:
-    """Explanations with the mirror images of those that weigh at least `REFLECTED`.
+def reflected(
+    found: Identification, near: Neighbourhoods, masked: Bools, known: Bools | None = None
+) -> Identification:
+    """Explanations with the mirror images of those that weigh at least `REFLECTED`, or `STAYS` if known.
 
     Parameters
     ----------
@@ -93,9 +97,14 @@ def reflected(found: Identification, near: Neighbourhoods, masked: Bools) -> Ide
         Neighbourhoods, and the largest number of manipulated meters that is promised.
     masked : (p,)
         Masked meters: they count in that number.
+    known : (k, q)
+        Explanations of an earlier search.
     """
     found_by, likelier = costs_of(found), False
-    for k in np.flatnonzero(found.weight >= REFLECTED).tolist():
+    before = set() if known is None else {each.tobytes() for each in known}
+    for k in np.flatnonzero(found.weight >= STAYS).tolist():
+        if found.weight[k] < REFLECTED and found.chosen[k].tobytes() not in before:
+            continue
         cost = found_by[int(found.model[k])]
         own = cost[found.chosen[k].tobytes()]
         for image, more in _images(found.problems[int(found.model[k])], found.chosen[k], near, masked):

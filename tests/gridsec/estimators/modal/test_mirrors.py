@@ -187,6 +187,27 @@ def test_a_mirror_image_that_was_found_with_its_own_penalty_has_that_of_its_set(
         assert not found.certain[-1]
 
 
+@pytest.mark.parametrize(
+    ("weight", "before", "reflected"),
+    [
+        (0.02, False, True),
+        (0.005, False, False),
+        (0.005, True, True),
+        (0.001, True, False),
+    ],
+)
+def test_an_image_stays_where_its_set_loses_some_weight(weight: float, before: bool, reflected: bool) -> None:
+    """The busbar's meter beside a likelier false power; all other sets of the search before do not count."""
+    of = kernel(12)
+    given = looked(of, np.full(12, 0.04))
+    q = given.chosen.shape[1]
+    busbar, power, meters = np.arange(q) == q - 1, np.arange(q) == 14, np.arange(q) < 12
+    costs = {power.tobytes(): 0.0, busbar.tobytes(): -2.0 * float(np.log(weight / (1.0 - weight)))}
+    each = identified(given.problems, (costs, *({} for _ in given.problems[1:])))
+    found = mirrors.reflected(each, of.near, NONE, np.stack([busbar if before else power]))
+    assert (found.chosen == meters).all(axis=1).any() == reflected
+
+
 @pytest.mark.parametrize(("most", "masked"), [(2, 0), (3, 0), (3, 1), (4, 1)])
 def test_all_others_of_a_lateral_have_an_image_within_the_promise(most: int, masked: int) -> None:
     """Meter 4 of the meters 4 to 7, which belong to two branches; the others are one lateral."""
