@@ -333,7 +333,7 @@ class TestFeeders:
             out.append(seen)
         return out
 
-    @pytest.mark.canary("replay-replay")
+    @pytest.mark.canary("bias-offset")
     @pytest.mark.parametrize(
         ("kind", "look"),
         [
@@ -433,6 +433,7 @@ class TestFeeders:
         assert verdict is not None
         assert not verdict.suspects.any()
 
+    @pytest.mark.acceptance
     def test_a_replay_of_what_was_never_reported_is_no_repetition(
         self, street: tuple[Site, DesignedEstimator]
     ) -> None:
