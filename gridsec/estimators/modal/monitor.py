@@ -79,7 +79,7 @@ from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.doubts import Movements, Unknown
 from gridsec.estimators.modal.estimate import Reconstructed, Spread
-from gridsec.estimators.modal.naming import CONFIRM, alone, final, unseen
+from gridsec.estimators.modal.naming import CONFIRM, SEVERAL, alone, final, unseen
 from gridsec.estimators.modal.record import Record
 from gridsec.estimators.modal.search import DOUBT
 from gridsec.estimators.plant import Plant
@@ -397,9 +397,8 @@ def _named(
     due, earlier = tick + wait, suspicion.earlier(state.suspicion)
     after = replace(state, suspicion=suspicion, streak=streak, phases=phases, inverters=inverters, due=due)
     since = () if any_of(masked) else state.core.history.readings[-age:]
-    sure = final(
-        suspicion.found, earlier, named, streak, since, kernel.near.laterals, settled=suspicion.settled
-    )
+    settled = suspicion.settled or age <= SEVERAL
+    sure = final(suspicion.found, earlier, named, streak, since, kernel.near.laterals, settled=settled)
     if suspicion.fits and not any_of(sure):
         # Masked meters alone may have been manipulated before they were masked.
         sure = alone(suspicion.found, masked)

@@ -102,7 +102,8 @@ def confirmed(
     since
         Ticks since the suspected onset; none where meters are masked, and may collude with others.
     settled
-        The likeliest explanation takes nearly all of the misfit away.
+        The likeliest explanation takes nearly all of the misfit away, or the onset is `SEVERAL` ticks old at
+        most: manipulations that begin one after another leave more.
     """
     sole = any_of(named) and np.count_nonzero(found.chosen[0]) == 1
     readings = sum(seen is None or all_of(seen[named]) for _, _, seen, *_ in since)

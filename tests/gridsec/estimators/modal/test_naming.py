@@ -73,6 +73,16 @@ def test_a_part_is_not_masked_where_a_power_then_explains_the_rest() -> None:
     assert naming.final(found, None, mask(0, 1), later, (), NO_LATERALS).tolist() == mask(0, 1).tolist()
 
 
+@pytest.mark.parametrize(("settled", "searches"), [(True, naming.CONFIRM), (False, naming.SEVERAL)])
+def test_an_explanation_that_leaves_misfit_names_later(settled: bool, searches: int) -> None:
+    given = problem(3, p=8, others=0)
+    found = two(given, mask(0, 1, 2), mask(0, 1, 3), 0.5)
+    for streak in range(1, naming.SEVERAL + 1):
+        turns = np.full(8, streak)
+        named = naming.confirmed(found, None, mask(0, 1), turns, (), settled=settled)
+        assert named.tolist() == (mask(0, 1) & (streak >= searches)).tolist()
+
+
 def test_a_part_is_masked_where_the_rest_stays_likely() -> None:
     """Faults far apart: each explains its own readings, whatever else is read."""
     given = problem(1)
