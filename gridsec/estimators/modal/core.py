@@ -158,8 +158,8 @@ class CoreState:
     spell
         Ticks in turn with a pinned onset.
     began
-        Time of the first reading of the earliest pinned onset; infinite for none. Without a pinned onset it
-        is given up with that reading.
+        Time of the first reading of the earliest onset that was the likeliest when it was pinned; infinite
+        for none. Without a pinned onset it is given up with that reading.
     """
 
     filter: FilterState
@@ -177,7 +177,7 @@ class CoreState:
 
     @property
     def first(self) -> int:
-        """Number of the first kept reading of the earliest pinned onset."""
+        """Number of the first kept reading since `began`."""
         return sum(each[0] < self.began for each in self.history.readings)
 
     @property
@@ -364,21 +364,22 @@ def step(  # noqa: PLR0917  # the state, and one tick
 
 
 def _pins(onsets: Onsets, rows: Ints, age: int) -> Ints:
-    """Rows to pin: the likeliest ones, and the ramp with about the age of the earliest pinned onset."""
+    """Rows to pin: the likeliest ones, and the ramp with about the age of the earliest suspected onset."""
     ramps = np.flatnonzero(onsets.used & onsets.ramp)
     if not ramps.size or age <= onsets.age[rows].max():
         return rows
-    return np.concatenate([rows[:-1], ramps[[np.abs(onsets.age[ramps] - age).argmin()]]])
+    oldest = ramps[np.abs(onsets.age[ramps] - age).argmin()]
+    return rows if oldest in rows else np.append(rows[:-1], oldest)
 
 
 def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState, Evidence]:
-    """Mask the named meters from the earliest pinned onset on, by replaying the kept readings without theirs.
+    """Mask the named meters since `CoreState.began`, by replaying the kept readings without theirs.
 
     The onset that explains a drift best is late. False readings before it, which the filter has learned as
     errors of loads, speak against honest meters and for those that are not named yet. Meters that are masked
     already are unread from there on, too. Evidence against others stays: it is collected anew. Where the
-    onset is older than the kept readings, the filter before them is freed of the faults, and all onsets begin
-    with them.
+    onset of the explanations is older than the kept readings, the filter before them is freed of the faults,
+    and all onsets begin with them.
 
     Parameters
     ----------
@@ -456,15 +457,14 @@ def again(
         before, test = begun or before, detector.start(core.modes)
         kept = History((before, known, test, ()))
     test = detector.pin(test, np.zeros(0, np.intp))
-    now = CoreState(
-        before, known, test, None, kept, (), masking.none(core.modes), (), state.beyond, state.loads
-    )
+    parts, none = (before, known, test, None, kept, ()), masking.none(core.modes)
+    now = CoreState(*parts, none, beyond=state.beyond, loads=state.loads, began=state.began)
     evidence = Evidence(-inf, np.full(test.capital.shape, -inf))
     for k in range(len(kept.readings), len(history.readings)):
         t, m, seen, unknown, jump = history.readings[k]
         now, evidence = step(core, now, t, m, *change(k, seen, unknown), jump)
     # The loads have varied once.
-    return replace(now, loads=state.loads, began=min(now.began, state.began)), evidence
+    return replace(now, loads=state.loads), evidence
 
 
 def beside_unknown(
@@ -863,12 +863,12 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     """
     if state.update is None:
         raise InputInvalid([Problem("missing", "no reading is available yet")])
-    made, by, m = core.modes, core.estimator, state.history.readings[-1][1]
-    plain = estimates.honest(made, by, state.filter, state.static, loads=state.loads, m=m)
+    made, by = core.modes, core.estimator
+    plain = estimates.honest(made, by, state.filter, state.static, loads=state.loads)
     if suspicion is None:
         return plain
     others = (
-        estimates.honest(each.modes, by, each.filter, each.static, loads=each.loads, m=m)
+        estimates.honest(each.modes, by, each.filter, each.static, loads=each.loads)
         for each in state.rivals[1:]
     )
     before = [plain, *others]

@@ -163,7 +163,6 @@ def honest(
     static: Static,
     *,
     loads: float = 1.0,
-    m: Floats | None = None,
 ) -> Estimated:
     """Estimate without a fault; O(n t).
 
@@ -177,17 +176,11 @@ def honest(
         The filter after the last tick, and the information about the directions.
     loads
         Variance of the loads' errors that vary, in those of the model, 1.
-    m : (t,)
-        Residuals of the last tick, for the rest beside unknown directions.
     """
     if state.full is not None:
         w, b = state.full.mean @ modes.U
-        mean, spread = (
-            _mean(made, w, b, static.score),
-            partial(_full_variance, modes, made, state.full, loads),
-        )
-        known = m is None or state.full.unknown is None
-        return Estimated(mean, spread, None if known else m - state.full.mean.sum(axis=0))
+        spread = partial(_full_variance, modes, made, state.full, loads)
+        return Estimated(_mean(made, w, b, static.score), spread, state.full.rest)
     w, b = state.mean
     if modes.sign.size:
         g_w, g_b = static.signature
@@ -312,6 +305,7 @@ def corrected(before: Sequence[Estimated], T: Sequence[Floats], found: Identific
 
 
 def _rest(each: Estimated) -> tuple[Floats, ...]:
+    """The rest of an estimate, if there is one."""
     return () if each.rest is None else (each.rest,)
 
 

@@ -80,6 +80,8 @@ class Full:
         Ticks since ``share`` was computed.
     unknown : (t, k) or None
         Directions of the residuals that were unknown at the last tick, times their standard deviations.
+    m : (t,) or None
+        Residuals of that tick; None before the first.
     """
 
     mean: Floats
@@ -90,6 +92,12 @@ class Full:
     share: Floats | None = field(default=None, repr=False)
     since: int = 0
     unknown: Floats | None = field(default=None, repr=False)
+    m: Floats | None = field(default=None, repr=False)
+
+    @property
+    def rest(self) -> Floats | None:
+        """Residuals of the last tick less the means of w and b, (t,); None without unknown directions."""
+        return None if self.unknown is None or self.m is None else self.m - self.mean[0] - self.mean[1]
 
     @property
     def cov(self) -> Floats:

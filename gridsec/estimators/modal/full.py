@@ -167,7 +167,7 @@ def updated(  # noqa: PLR0917  # the filter, and one tick
     if not rows.size:
         none = np.zeros((2 * t, 0))
         nothing = Innovation(rows, none[:0], none, none[0], np.zeros(t), none[0])
-        return Full(mean, (w, both, b), np.zeros(t, np.bool_), before.kept, 0, unknown=unknown), nothing
+        return Full(mean, (w, both, b), np.zeros(t, np.bool_), before.kept, 0, unknown=unknown, m=m), nothing
     complete, nu = before.complete + 1 if seen is None else 0, (m - mean[0] - mean[1])[rows]
     HP = np.empty((rows.size, 2 * t))
     np.add(w.take(rows, axis=0), both.take(rows, axis=1).T, out=HP[:, :t])
@@ -190,7 +190,7 @@ def updated(  # noqa: PLR0917  # the filter, and one tick
     precision = np.zeros(t)
     precision[rows] = (inverse * inverse).sum(axis=0)
     seen = np.ones(t, dtype=np.bool_) if seen is None else seen
-    return Full(mean, (w, both, b), seen, before.kept, complete, unknown=unknown), Innovation(
+    return Full(mean, (w, both, b), seen, before.kept, complete, unknown=unknown, m=m), Innovation(
         rows, half, gain, white, precision, score
     )
 

@@ -79,7 +79,7 @@ from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.doubts import Movements, Unknown
 from gridsec.estimators.modal.estimate import Reconstructed, Spread
-from gridsec.estimators.modal.naming import CONFIRM, SEVERAL, alone, final, unseen
+from gridsec.estimators.modal.naming import CONFIRM, YOUNG, alone, final, unseen
 from gridsec.estimators.modal.record import Record
 from gridsec.estimators.modal.search import DOUBT
 from gridsec.estimators.plant import Plant
@@ -397,7 +397,7 @@ def _named(
     due, earlier = tick + wait, suspicion.earlier(state.suspicion)
     after = replace(state, suspicion=suspicion, streak=streak, phases=phases, inverters=inverters, due=due)
     since = () if any_of(masked) else state.core.history.readings[-age:]
-    settled = suspicion.settled or age <= SEVERAL
+    settled = suspicion.settled or age <= YOUNG
     sure = final(suspicion.found, earlier, named, streak, since, kernel.near.laterals, settled=settled)
     if suspicion.fits and not any_of(sure):
         # Masked meters alone may have been manipulated before they were masked.
@@ -621,12 +621,13 @@ def _estimate(
     plant, now = front.plant, state.front
     errors = core.estimate(kernel, state.core, state.suspicion)
     mean, whole, more, metered = errors.mean, state.core.filter.full, None, measured.busbar_metered
-    if tick.unknown is not None and whole is not None and errors.rest is not None:
+    if tick.unknown is not None and whole is not None:
         read, hidden = whole.seen, _hidden(state.core, tick.unknown)
+        rest = tick.m - whole.mean.sum(axis=0) if errors.rest is None else errors.rest
         if state.suspicion is not None:
             read = read & ~verdict.accused(kernel, state.suspicion)
         noise = kernel.modes.noise + whole.whole
-        off, more = doubts.estimated(noise, tick.unknown, errors.rest, read, hidden=hidden)
+        off, more = doubts.estimated(noise, tick.unknown, rest, read, hidden=hidden)
         mean = mean + off
     v2_bus, first = tick.predicted.v2_bus + mean, plant.feeder.busbar_places()
     least: Floats | float = front.busbar**2

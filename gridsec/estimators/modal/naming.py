@@ -43,6 +43,8 @@ LASTS = 0.5
 """Least part of a sole fault in its last reading, 1: the reading is nearer to the fault than to none."""
 SEVERAL = 4
 """Searches in turn before a meter is named beside others that are not confirmed yet."""
+YOUNG = 4
+"""Age of an onset up to which an explanation may leave misfit, ticks: a meter may lie at one of these."""
 WHOLE = 4 * SEVERAL
 """Searches in turn after which meters are masked even if others explain the rest without their readings."""
 SURE = 0.95
@@ -102,8 +104,7 @@ def confirmed(
     since
         Ticks since the suspected onset; none where meters are masked, and may collude with others.
     settled
-        The likeliest explanation takes nearly all of the misfit away, or the onset is `SEVERAL` ticks old at
-        most: manipulations that begin one after another leave more.
+        The likeliest explanation takes nearly all of the misfit away, or the onset is `YOUNG`.
     """
     sole = any_of(named) and np.count_nonzero(found.chosen[0]) == 1
     readings = sum(seen is None or all_of(seen[named]) for _, _, seen, *_ in since)

@@ -357,6 +357,8 @@ def bounding(
 ) -> Bools | bool:
     """Phases of the busbar with a reading that bounds the voltages, (b,): none that may be manipulated.
 
+    While an onset is pinned and no explanation is there, none bounds them.
+
     Parameters
     ----------
     core, state, suspicion
@@ -369,7 +371,7 @@ def bounding(
     found, first = suspicion.found, core.modes.size + core.faults.powers
     some = core.modes.model.phases(core.modes.at).any(axis=0)
     out = np.zeros(some.size, dtype=np.bool_)
-    out[some] = found.chosen[found.weight >= LIKELY, first:].any(axis=0)
+    out[some] = found.weight @ found.chosen[:, first:] >= LIKELY
     return np.asarray(metered & ~out)
 
 

@@ -131,7 +131,7 @@ def test_weights_beside_unknown_directions_are_the_change_of_the_estimate(seed: 
     after, info = before.filter, before.static
     for _ in range(SINCE):
         after, info, _ = full.step(modes, after, info, after.t + 1.0, step, stay=True, unknown=unknown.wide)
-    found, whole = estimate.honest(modes, kernel.estimator, after, info, m=step), after.full
+    found, whole = estimate.honest(modes, kernel.estimator, after, info), after.full
     assert whole is not None
     assert found.rest is not None
     off, variance = doubts.estimated(modes.noise + whole.whole, unknown, found.rest, whole.seen)

@@ -139,7 +139,7 @@ def test_equals_the_joint_gaussian_beside_unknown_directions(fault: str, wide: f
         if k >= onset:
             since = replay.follow(made, since, update.exact, update.gap)
     prepared = estimate.estimator(made)
-    found = estimate.honest(made, prepared, state, more, m=m[-1])
+    found = estimate.honest(made, prepared, state, more)
     assert found.rest is not None
     amount = np.zeros(1)
     if fault != "none":

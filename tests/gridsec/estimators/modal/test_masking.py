@@ -136,6 +136,9 @@ def test_a_long_suspected_ramp_stays_a_candidate(kernel: Core) -> None:
     assert onsets.ramp[pins[-1]]
     assert abs(onsets.age[pins[-1]] - 70) == np.abs(onsets.age[ramps] - 70).min()
     assert core._pins(onsets, young, 1) is young
+    # A ramp that is pinned anyway takes the place of no other onset.
+    with_ramp = np.concatenate([pins[-1:], young[:-1]])
+    assert core._pins(onsets, with_ramp, 70) is with_ramp
 
 
 def test_a_single_reading_replaces_no_smaller_amount(kernel: Core) -> None:

@@ -261,16 +261,17 @@ def test_loads_that_jump_accuse_no_honest_meter(kind: str, liar: bool) -> None:
     assert named[LIAR] == liar
 
 
-@pytest.mark.parametrize("missing", [False, True])
-def test_a_load_that_no_report_shows_is_adopted(missing: bool) -> None:
+@pytest.mark.parametrize(("missing", "open_"), [(False, False), (True, False), (False, True)])
+def test_a_load_that_no_report_shows_is_adopted(missing: bool, open_: bool) -> None:
     """11 kW for good at the root: the alarm ends, and the voltages at all meters are those with the load."""
     kernel = core.assemble(MODEL, STEPS_OF_PLACES, np.full(12, 0.1), gamma=1e6)
     source, state = Source(MODEL, np.random.default_rng(1)), core.init(kernel, 0.0)
     seen = np.arange(12) != 11 if missing else None
+    unknown = 0.002 * STEPS[:, 5:6] if open_ else None
     alarms = adopted = 0
     for k in range(130):
         m = source.tick() + STEPS[:, 0] * (-0.11 if k >= 60 else 0.0)
-        state, evidence = core.step(kernel, state, float(k), m, seen)
+        state, evidence = core.step(kernel, state, float(k), m, seen, unknown)
         if core.alarmed(kernel, evidence):
             alarms += 1
             suspicion = core.identify(kernel, state, evidence)
@@ -278,6 +279,11 @@ def test_a_load_that_no_report_shows_is_adopted(missing: bool) -> None:
             after = core.adopt(kernel, state, suspicion)
             adopted += after is not state
             state = after
+            # The voltages are those of the tick that is adopted.
+            now = core.estimate(kernel, state)
+            assert np.isfinite(now.mean).all()
+            assert now.rest is None or np.allclose(now.rest, m - state.filter.full.mean.sum(axis=0))
+            assert (now.rest is None) == (unknown is None)
     assert alarms
     assert 1 <= adopted <= 3
     assert not core.alarmed(kernel, evidence)
