@@ -43,8 +43,8 @@ LASTS = 0.5
 """Least part of a sole fault in its last reading, 1: the reading is nearer to the fault than to none."""
 SEVERAL = 4
 """Searches in turn before a meter is named beside others that are not confirmed yet."""
-YOUNG = 4
-"""Age of an onset up to which an explanation may leave misfit, ticks: a meter may lie at one of these."""
+YOUNG = 8
+"""Age of an onset up to which an explanation may leave misfit, ticks: clocks off by 3 s spread it over 6."""
 WHOLE = 4 * SEVERAL
 """Searches in turn after which meters are masked even if others explain the rest without their readings."""
 SURE = 0.95
