@@ -33,9 +33,12 @@ def test_no_honest_meter_is_accused(situation: str, seed: int) -> None:
 
 
 @pytest.mark.acceptance
-@pytest.mark.parametrize("seed", [210, 232, 288])
-def test_a_third_that_drifts_is_named(seed: int) -> None:
-    one = run("drift", seed)
+@pytest.mark.parametrize(
+    ("seed", "model"),
+    [(210, None), (232, None), (288, None), (508, Model.CLOCKS), (7107, Model.CLOCKS), (7108, Model.CLOCKS)],
+)
+def test_a_third_that_drifts_is_named(seed: int, model: Model | None) -> None:
+    one = run("drift", seed, model=model)
     assert one.accused == ()
     assert sorted(one.named) == sorted(one.manipulated)
 
