@@ -40,7 +40,7 @@ from gridsec.estimators.modal import core, verdict
 from gridsec.estimators.modal.core import Core, CoreState, Suspicion
 from gridsec.estimators.modal.detector import Evidence
 from gridsec.estimators.modal.monitor import LOOKS
-from gridsec.estimators.modal.naming import CONFIRM, confirmed
+from gridsec.estimators.modal.naming import CONFIRM, YOUNG, confirmed
 from gridsec.grid.network import Power
 
 QUIET, WATCHED, RAMP = 60, 60, 90
@@ -111,7 +111,8 @@ class Watch:
         earlier, self.suspicion, self.streak = found.earlier(self.suspicion), found, streak
         self.due = tick + (1 if (streak[named] == 1).any() or self.phases == 1 else max(1, age // LOOKS))
         since = () if self.state.masked.meters.any() else self.state.history.readings[-age:]
-        sure = confirmed(found.found, earlier, named, streak, since)
+        settled = found.settled or age <= YOUNG
+        sure = confirmed(found.found, earlier, named, streak, since, settled=settled)
         if sure.any():
             final = replace(found, found=replace(found.found, named=sure))
             self.state, _ = core.mask(self.kernel, self.state, final)
