@@ -140,22 +140,14 @@ class Known:
         """Unknown directions for the filter, (p, k)."""
         return None if self.unknown is None else self.unknown.wide
 
-    def regression(self, core: Core) -> Floats:
-        """Regression of the unknown errors at all places on the rest of the residuals, (p, n)."""
-        whole = self.filter.full
-        if self.unknown is None or whole is None:
-            return np.zeros((core.modes.size, len(core.effect)))
-        every = np.arange(core.modes.size)
-        return doubts.regression(core.modes.noise + whole.whole, self.unknown, every)[0]
-
     def variance(self, core: Core) -> Floats:
         """Variance of the estimate at all places, (n,), squared pu^2."""
         out = estimate.honest(core.modes, core.estimator, self.filter, self.static).variance
-        if self.unknown is None:
+        whole, p = self.filter.full, core.modes.size
+        if self.unknown is None or whole is None:
             return out
-        cross = self.unknown.meters @ self.unknown.places.T
-        more = (self.unknown.places**2).sum(axis=1) - (self.regression(core) * cross).sum(axis=0)
-        return np.asarray(out + more)
+        noise, every = core.modes.noise + whole.whole, np.ones(p, dtype=np.bool_)
+        return np.asarray(out + doubts.regressed(noise, self.unknown, np.zeros(p), every)[1])
 
 
 def known(
@@ -302,12 +294,13 @@ def _tests(  # noqa: PLR0917  # the core, and one onset
     rows = scores, *_class_rows(core, now, joint)
     quadratic, offset = _omnibus(told, SIZE**2 / made.white)
     half = np.linalg.cholesky(quadratic).T @ scored / sqrt(2.0 * left[1] + offset)
-    n = len(core.effect)
-    # What corrects the estimate, and what then moves the unknown errors.
+    n, whole = len(core.effect), now.filter.full
+    # The estimate moves as its correction, and with the unknown errors by the rest of the residuals.
     moved = estimate.moves(made, core.estimator, now.filter, joint, np.eye(p), np.zeros((n, p)))
     weights = -moved[:n]
-    if now.unknown is not None:
-        weights = weights - now.regression(core).T @ moved[n:]
+    if now.unknown is not None and whole is not None:
+        gain, _ = doubts.regression(made.noise + whole.whole, now.unknown, np.arange(p))
+        weights = weights - gain.T @ moved[n:]
     limits = np.concatenate([members, others, rows[2]])
     counted = np.isfinite(limits)
     return StepTests(

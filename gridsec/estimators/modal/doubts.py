@@ -377,20 +377,28 @@ def estimated(
     hidden
         No reading narrows the variance of powers and injections.
     """
-    mean, variance = _regressed(noise, given, u, seen)
+    mean, variance = regressed(noise, given, u, seen)
     if hidden:
         powers, others = given.places[:, : given.powers], given.places.copy()
         others[:, : given.powers] = 0.0
-        other, variance = _regressed(noise, replace(given, places=others), u, seen)
+        other, variance = regressed(noise, replace(given, places=others), u, seen)
         variance = variance + (powers**2).sum(axis=1) + (mean - other) ** 2
     elif any_of(given.unchecked & seen):
-        other, variance = _regressed(noise, given, u, seen & ~given.unchecked)
+        other, variance = regressed(noise, given, u, seen & ~given.unchecked)
         variance = variance + (mean - other) ** 2
     return mean, variance
 
 
-def _regressed(noise: Floats, given: Unknown, u: Floats, seen: Bools) -> tuple[Floats, Floats]:
-    """Regression on the meters `seen` (p,)."""
+def regressed(noise: Floats, given: Unknown, u: Floats, seen: Bools) -> tuple[Floats, Floats]:
+    """Mean and variance of the unknown errors at all places by the readings of some meters, (n,) each.
+
+    Parameters
+    ----------
+    noise, given, u
+        As in `estimated`.
+    seen : (p,)
+        The meters.
+    """
     n, variance = indices(seen), (given.places**2).sum(axis=1)
     gain, cross = regression(noise, given, n)
     return gain.T @ u[n], np.maximum(variance - (gain * cross).sum(axis=0), 0.0)

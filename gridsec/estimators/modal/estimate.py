@@ -290,7 +290,8 @@ def corrected(before: Sequence[Estimated], T: Sequence[Floats], found: Identific
     for k in models:
         of = model == k
         moved, variance = explained(found.problems[k], chosen[of], weight[of], T[k])
-        means[of] = np.concatenate([before[k].mean, *_rest(before[k])]) + moved
+        parts = [before[k].mean, before[k].rest]
+        means[of] = np.concatenate([each for each in parts if each is not None]) + moved
         by_amounts += variance
     mean, rest = np.split(weight @ means, [n])
     means, by_amounts = means[:, :n], by_amounts[:n]
@@ -302,11 +303,6 @@ def corrected(before: Sequence[Estimated], T: Sequence[Floats], found: Identific
         return np.asarray(np.maximum(before_each + by_amounts + weight @ apart, POSSIBLE * possible))
 
     return Estimated(mean, spread, rest if rest.size else None)
-
-
-def _rest(each: Estimated) -> tuple[Floats, ...]:
-    """The rest of an estimate, if there is one."""
-    return () if each.rest is None else (each.rest,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
