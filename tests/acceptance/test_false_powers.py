@@ -40,7 +40,7 @@ def test_a_power_that_is_false_is_told_as_a_power(size: float, runs: int) -> Non
                 assert named or accused, verdict.reason
         told += loud
     # A load beyond the customer's connection is not believed in the first place, and changes nothing.
-    assert told >= runs // 4
+    assert told >= max(1, runs // 4)
 
 
 def test_residuals_made_with_a_power_that_was_doubted_name_nobody_afterwards() -> None:
