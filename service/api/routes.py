@@ -80,8 +80,9 @@ def create_api(
     app.add_route(guide.ADDRESS, guide.show, include_in_schema=False)
     app.add_route(guide.DOCS, guide.show_docs, include_in_schema=False)
     app.mount("/", _Web(directory=_WEB, html=True), name="web")
-    _describe(app)
-    app.state.queries = _queries(app.openapi())
+    schema = json.loads(_described[0] if _described else _description(app))
+    app.openapi = lambda: schema  # type: ignore[method-assign]  # FastAPI's way to extend the description
+    app.state.queries = _queries(schema)
     return app
 
 
@@ -117,8 +118,12 @@ def _fits(template: str, path: str) -> bool:
     )
 
 
-def _describe(app: FastAPI) -> None:
-    """Write the OpenAPI description once, with errors as problems."""
+_described: list[str] = []
+"""Description of the first application of a process: all have the same routes, and it takes a second."""
+
+
+def _description(app: FastAPI) -> str:
+    """OpenAPI description, JSON, with errors as problems."""
     schema = app.openapi()
     error = {"$ref": "#/components/schemas/Problem"}
     for path in schema["paths"].values():
@@ -136,7 +141,8 @@ def _describe(app: FastAPI) -> None:
     text = json.dumps(schema)
     for name, shown in models.RENAMED.items():
         text = text.replace(f'"#/components/schemas/{name}"', f'"#/components/schemas/{shown}"')
-    app.openapi_schema = json.loads(text)
+    _described.append(text)
+    return text
 
 
 def _queries(schema: dict[str, Any]) -> dict[tuple[str, str], frozenset[str]]:
