@@ -24,23 +24,14 @@ off is no reason to doubt all others of its phase.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, any_of
-from gridsec.estimators.modal.alike import Alike
-from gridsec.estimators.modal.costs import (
-    SearchProblem,
-    Tableau,
-    among,
-    common_cost,
-    informed,
-    mean_likelihood,
-    padded,
-)
-from gridsec.estimators.modal.laterals import clusters, coded, similar
+from gridsec.estimators.modal.costs import SearchProblem, among, costs, informed, penalties
+from gridsec.estimators.modal.laterals import clusters, coded
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.search import ALIKE, Identification, costs_of, extended
 
@@ -102,59 +93,64 @@ def reflected(
     """
     found_by, likelier = costs_of(found), False
     before = set() if known is None else {each.tobytes() for each in known}
-    for k in np.flatnonzero(found.weight >= STAYS).tolist():
-        if found.weight[k] < REFLECTED and found.chosen[k].tobytes() not in before:
-            continue
-        cost = found_by[int(found.model[k])]
-        own = cost[found.chosen[k].tobytes()]
-        for image, more in _images(found.problems[int(found.model[k])], found.chosen[k], near, masked):
-            key = image.tobytes()
-            if own + more < cost.get(key, np.inf):
-                cost[key], likelier = own + more, True
+    stays = np.array([each.tobytes() in before for each in found.chosen])
+    some = found.weight >= np.where(stays, STAYS, REFLECTED)
+    for model in np.unique(found.model[some]).tolist():
+        sets, cost = found.chosen[some & (found.model == model)], found_by[model]
+        for of, images in zip(sets, _images(found.problems[model], sets, near, masked), strict=True):
+            own = cost[of.tobytes()]
+            for image, more in images:
+                key = image.tobytes()
+                if own + more < cost.get(key, inf):
+                    cost[key], likelier = own + more, True
     return extended(found, found_by) if likelier else found
 
 
 def _images(
-    problem: SearchProblem, chosen: Bools, near: Neighbourhoods, masked: Bools
-) -> Iterator[tuple[Bools, float]]:
-    """Mirror images of a set, (q,), and their costs beyond its own."""
+    problem: SearchProblem, sets: Bools, near: Neighbourhoods, masked: Bools
+) -> list[list[tuple[Bools, float]]]:
+    """Mirror images of each of some sets (k, q), and their costs beyond its own."""
+    read, (p, b) = informed(problem), near.phases.shape
+    likelihood, out = _Likelihood(problem, sets), list[list[tuple[Bools, float]]]([] for _ in sets)
+    phases = [one for k, each in enumerate(sets) for one in _of_phases(problem, each, k, near, read, masked)]
+    rows, parts, inside, outside = _of_laterals(sets, near, read, masked)
+    # One amount of the meters that are off, in place of theirs.
+    at = np.concatenate([np.array([k for k, *_ in phases], dtype=np.intp), rows])
+    rest = np.vstack([*(sets[k] & image for k, image, *_ in phases), parts])
+    more = likelihood(at, rest, np.vstack([*(column for *_, column in phases), inside])) - likelihood.own[at]
+    for (k, image, less, _), one in zip(phases, more, strict=False):
+        out[k].append((image, less + max(float(one), 0.0) if one <= APART else inf))
+    alike = more[len(phases) :] <= APART
+    rows, parts, outside = rows[alike], parts[alike], outside[alike]
+    own = likelihood.own[rows] + np.minimum(more[len(phases) :][alike], 0.0)
+    # Each image with the false powers of its set, and without them.
+    without = np.flatnonzero(parts[:, p:-b].any(axis=1))
+    dropped = np.concatenate([np.zeros(rows.size), parts[without, p:-b] @ problem.charge[p:-b]])
+    every = np.concatenate([np.arange(rows.size), without])
+    images = parts[every]
+    images[rows.size :, p:-b] = False
+    more = likelihood(rows[every], images, outside[every]) - own[every] - dropped
+    images[:, :p] |= outside[every]
+    for k, image, one in zip(rows[every].tolist(), images, more.tolist(), strict=True):
+        out[k].append((image, one))
+    return out
+
+
+def _of_phases(  # noqa: PLR0917  # one set, and what its images depend on
+    problem: SearchProblem, chosen: Bools, k: int, near: Neighbourhoods, read: Bools, masked: Bools
+) -> Iterator[tuple[int, Bools, float, Bools]]:
+    """Number of the set, its images by phases of the busbar, their charges, and the meters off in both."""
     p, b = near.phases.shape
-    read = informed(problem)
-    likelihood = _Likelihood(problem, chosen)
+    laterals = (near.laterals & read).astype(np.float64)
     for phase in range(b):
         image, column = _of_phase(chosen, near, phase, read, masked)
-        if image is not None:
-            more = 0.0
-            if not chosen[phase - b]:
-                both = coded(
-                    np.stack([chosen[:p], image[:p]]), (near.laterals & read).astype(np.float64), read
-                )
-                more = float(both[1] - both[0] + problem.charge[image].sum() - problem.charge[chosen].sum())
-            yield image, max(more, 0.0) + _apart(likelihood, chosen & image, column)
-    # The meters outside of a lateral are a neighbourhood within the promise. A majority beside the busbar's
-    # meter is no image: the level of all meters is unknown there.
-    inside, outside = near.laterals & read, ~near.laterals & read
-    few, others = (
-        np.count_nonzero((each ^ chosen[:p]) | masked, axis=1) <= near.most for each in (inside, outside)
-    )
-    busbar = np.count_nonzero(chosen[-b:])
-    kept = _manipulated(chosen, masked, b) <= near.most
-    laterals = np.vstack([inside[few | (busbar == 0)], outside[kept & others]])
-    sets = np.unique(np.hstack([laterals & ~chosen[:p], laterals & chosen[:p]]), axis=0)
-    sets = sets[sets[:, :p].any(axis=1) & sets[:, p:].any(axis=1)]
-    rest = np.tile(chosen, (len(sets), 1))
-    rest[:, :p] &= ~sets[:, p:]
-    own = likelihood(rest, sets[:, p:])
-    alike = own - likelihood.own <= APART
-    rest, own, others = rest[alike], np.minimum(likelihood.own, own[alike]), sets[alike, :p]
-    for powers in (True, False) if any_of(chosen[p:-b]) else (True,):
-        dropped = 0.0
-        if not powers:
-            dropped = float(problem.charge[p:-b] @ chosen[p:-b])
-            rest[:, p:-b] = False
-        images, more_of = rest.copy(), likelihood(rest, others) - own - dropped
-        images[:, :p] |= others
-        yield from zip(images, more_of.tolist(), strict=True)
+        if image is None:
+            continue
+        more = 0.0
+        if not chosen[phase - b]:
+            both = coded(np.stack([chosen[:p], image[:p]]), laterals, read)
+            more = float(both[1] - both[0] + problem.charge[image].sum() - problem.charge[chosen].sum())
+        yield k, image, max(more, 0.0), column
 
 
 def _of_phase(
@@ -174,94 +170,91 @@ def _of_phase(
     return (image if any_of(column) else None), column
 
 
-def _manipulated(chosen: Bools, masked: Bools, phases: int) -> int:
-    """Number of manipulated meters that counts in the promise: with masked meters, or with the busbar's."""
-    own = chosen[: masked.size]
-    return int(
-        max(
-            np.count_nonzero(own | masked),
-            np.count_nonzero(own) + np.count_nonzero(chosen[chosen.size - phases :]),
-        )
-    )
+def _of_laterals(
+    sets: Bools, near: Neighbourhoods, read: Bools, masked: Bools
+) -> tuple[Ints, Bools, Bools, Bools]:
+    """Sets and laterals with accused and with other meters.
+
+    Number of the set, its faults elsewhere (n, q), accused meters and others, (n, p) each. The meters outside
+    of a lateral are a neighbourhood within the promise. A majority beside the busbar's meter is no image: the
+    level of all meters is unknown there.
+    """
+    p, b = near.phases.shape
+    own, inside, outside = sets[:, None, :p], near.laterals & read, ~near.laterals & read
+    few, others = (np.count_nonzero((each ^ own) | masked, axis=2) <= near.most for each in (inside, outside))
+    busbar = np.logical_or.reduce(sets[:, -b:], axis=1)
+    kept = _manipulated(sets, masked, b) <= near.most
+    (row, at), (other, apart) = np.nonzero(few | ~busbar[:, None]), np.nonzero(kept[:, None] & others)
+    rows, region = np.concatenate([row, other]), np.vstack([inside[at], outside[apart]])
+    both = region & sets[rows, :p], region & ~sets[rows, :p]
+    some = np.flatnonzero(both[0].any(axis=1) & both[1].any(axis=1))
+    keys = np.hstack([rows[some, None], *(np.packbits(each[some], axis=1) for each in both)])
+    some = some[np.unique(keys, axis=0, return_index=True)[1]]
+    rows, accused, others = rows[some], both[0][some], both[1][some]
+    rest = sets[rows]
+    rest[:, :p] &= ~accused
+    return rows, rest, accused, others
 
 
-def _apart(likelihood: _Likelihood, rest: Bools, column: Bools) -> float:
-    """Cost of one amount in place of several, at least 0; infinite for `APART`."""
-    more = float(likelihood(rest[None], column[None])[0]) - likelihood.own
-    return max(more, 0.0) if more <= APART else inf
+def _manipulated(chosen: Bools, masked: Bools, phases: int) -> Ints:
+    """Manipulated meters of sets (..., q) in the promise: with masked ones, or with the busbar's."""
+    own, busbar = chosen[..., : masked.size], chosen[..., chosen.shape[-1] - phases :]
+    both = np.count_nonzero(own, axis=-1) + np.count_nonzero(busbar, axis=-1)
+    return np.asarray(np.maximum(np.count_nonzero(own | masked, axis=-1), both))
 
 
 class _Likelihood:
-    """L of parts of a set (q,) with one more column, with the priors of the amounts that count for the set.
+    """L of parts of sets with one more column, with the priors of the amounts that count for each set.
 
-    A column x is a row beside the tableau T of the set. Without the faults A of the set, the score, the
-    information and the pull of x lose ``T_xA T_AA^-1 T_A``, as those of the set do.
+    A prior that is far worse for a set is so for its images.
+
+    Parameters
+    ----------
+    problem, sets
+        The problem, and the sets, (k, q).
     """
 
-    def __init__(self, problem: SearchProblem, chosen: Bools) -> None:
-        self.problem, self.chosen = problem, chosen
-        several = np.count_nonzero(chosen[: problem.meters]) > 1
-        self.shares: tuple[float, ...] = (0.0, ALIKE) if several else (0.0,)
-        few, every = among(problem, chosen), np.ones(int(np.count_nonzero(chosen)), dtype=np.bool_)
-        starts = {share: Alike(few, share) if share else Tableau(few) for share in self.shares}
-        self.tableaus = {share: start.pivot(every) for share, start in starts.items()}
-        own = np.array([self._whole(share) for share in self.shares])
-        # A prior that is far worse for the set is so for its images.
-        likely = own <= own.min() + APART
-        self.shares = tuple(np.array(self.shares)[likely].tolist())
-        self.own = float(mean_likelihood(own[likely]))
+    def __init__(self, problem: SearchProblem, sets: Bools) -> None:
+        self.problem, every = problem, np.ones(len(sets), dtype=np.bool_)
+        each = self._each(sets, np.zeros((len(sets), problem.meters), dtype=np.bool_), every)
+        self.counted = each <= each.min(axis=0) + APART
+        self.own = self._mean(each, self.counted)
 
-    def _whole(self, share: float) -> float:
-        """L of the set."""
-        tableau = self.tableaus[share]
-        out = tableau.whole - float(tableau.penalty[tableau.count] + tableau.problem.charge.sum())
-        if isinstance(tableau, Alike):
-            out += float(self.problem.charge.max(initial=0.0)) - tableau.charge
-        return out
+    def __call__(self, rows: Ints, rest: Bools, columns: Bools) -> Floats:
+        """L of parts (n, q) of sets `rows` (n,) with meters `columns` (n, p) that have one amount, (n,)."""
+        counted = self.counted[:, rows]
+        return self._mean(self._each(rest, columns, counted[1]), counted)
 
-    def __call__(self, rest: Bools, columns: Bools) -> Floats:
-        """L of faults `rest` (n, q) and of meters `columns` (n, p) with one amount, (n,)."""
-        return mean_likelihood(self._each(rest, columns))
+    def _each(self, sets: Bools, columns: Bools, alike: Bools) -> Floats:
+        """L with independent amounts, and with amounts alike where these count, (2, n).
 
-    def _each(self, rest: Bools, columns: Bools) -> Floats:
-        """L with each prior that counts, (s, n); one meter has no amount in common with others."""
-        several = np.count_nonzero(rest[:, : self.problem.meters], axis=1) > 1
-        shares = {share for share in self.shares if several.any()}
-        each = {s: self._with(rest, columns, s) for s in (shares if several.all() else shares | {0.0})}
-        plain = each.get(0.0, np.zeros(len(rest)))
-        return np.stack([np.where(several, each.get(share, plain), plain) for share in self.shares])
+        A column is a fault of its own beside the meters; it has the largest charge, which `costs` adds for
+        amounts alike. One meter has no amount in common with others.
+        """
+        problem, p, used = self.problem, self.problem.meters, np.logical_or.reduce(sets, axis=0)
+        charge, few = float(problem.charge.max(initial=0.0)), among(problem, used)
+        count = np.count_nonzero(sets[:, :p], axis=1)
+        own = penalties(few.meters)[count] + sets @ problem.charge + charge
+        distinct, which = np.unique(columns, axis=0, return_inverse=True)
+        g, c = distinct.astype(np.float64), len(distinct)
+        side = g @ problem.F[:p]
+        few = replace(
+            few,
+            y=np.concatenate([few.y, g @ problem.y[:p]]),
+            F=np.block([[few.F, side[:, used].T], [side[:, used], side[:, :p] @ g.T]]),
+            std=np.append(few.std, np.full(c, problem.std[0])),
+            charge=np.append(few.charge, np.full(c, charge)),
+            bound=np.append(few.bound, np.full(c, inf)),
+        )
+        sets = np.hstack([sets[:, used], which.reshape(-1, 1) == np.arange(c)])
+        plain, several = costs(few, sets), np.flatnonzero(alike & (count > 1))
+        out = np.stack([plain, plain])
+        if several.size:
+            out[1, several] = costs(few, sets[several], ALIKE)
+        return np.asarray(out - own)
 
-    def _with(self, rest: Bools, columns: Bools, share: float) -> Floats:
-        """L with a share of the variance of the meters in common, (n,)."""
-        problem, tableau, p = self.problem, self.tableaus[share], self.problem.meters
-        q, r, s2 = len(tableau.order), len(tableau.rows), float(problem.std[0]) ** 2
-        lacks, side = ~rest[:, self.chosen], columns @ problem.F[:p]
-        own = side[:, self.chosen]
-        x = -own @ tableau.beside[:q]
-        # Entries of the column with the borders and with itself.
-        beside = -x @ tableau.rows.T
-        beside[:, 0] += columns @ problem.y[:p]
-        pivot = 1.0 / s2 + (side[:, :p] * columns).sum(axis=1) - np.vecdot(x, own)
-        meters = np.count_nonzero(rest[:, :p], axis=1)
-        out = np.full(len(rest), tableau.cost - float(tableau.penalty[tableau.count]))
-        out -= tableau.problem.charge.sum() + lacks @ tableau.size
-        information = meters / (1.0 - share) + tableau.borders[q + r - 1, r - 1]
-        score = np.full(len(rest), -tableau.borders[q, r - 1])
-        for places in similar(np.count_nonzero(lacks, axis=1).tolist()):
-            at, inside = padded(lacks[places])
-            A, v = tableau.within(at, inside), tableau.borders[at].transpose(0, 2, 1)
-            v = np.concatenate([v, np.take_along_axis(x[places], at, axis=1)[:, None]], axis=1)
-            v *= inside[:, None, :]
-            inner = v @ np.linalg.solve(A, v.transpose(0, 2, 1))
-            out[places] += np.linalg.slogdet(A)[1] - inner[:, 0, 0]
-            score[places] += inner[:, 0, r - 1]
-            information[places] -= inner[:, r - 1, r - 1]
-            beside[places] -= inner[:, :r, r]
-            pivot[places] -= inner[:, r, r]
-        pull = beside[:, 0]
-        out += np.log(s2 * pivot) - pull * pull / pivot
-        if share:
-            left = beside[:, 1]
-            score, information = score + left * pull / pivot, information - left * left / pivot
-            out += common_cost(share, score, information) + problem.charge.max(initial=0.0)
-        return np.asarray(out)
+    @staticmethod
+    def _mean(each: Floats, counted: Bools) -> Floats:
+        """Costs of the mean of the likelihoods that count, (n,)."""
+        log_sum = np.logaddexp.reduce(np.where(counted, -0.5 * each, -inf), axis=0)
+        return np.asarray(-2.0 * (log_sum - np.log(np.count_nonzero(counted, axis=0))))

@@ -64,26 +64,31 @@ def test_likelihoods_of_parts_of_a_set_with_a_column_are_exact(seed: int) -> Non
     random = np.random.default_rng(seed)
     given = replace(problem(4 + seed, p=9, others=3), std=random.uniform(0.5, 2.0, 12))
     chosen = np.isin(np.arange(12), (0, 2, 3, 5, 6, 9, 11))
-    likelihood = mirrors._Likelihood(given, chosen)
+    likelihood = mirrors._Likelihood(given, np.stack([np.arange(12) == 10, chosen]))
+    of = np.ones(20, dtype=np.intp)
     rest = chosen & (random.random((20, 12)) < np.linspace(0.0, 1.0, 20)[:, None])
     columns = (random.random((20, 9)) < 0.4) & ~rest[:, :9]
     columns[7] = False
     own = [of_column(given, chosen, columns[7], share) for share in (0.0, ALIKE)]
     counted = [k for k in range(2) if own[k] <= min(own) + mirrors.APART]
-    assert likelihood.own == pytest.approx(float(mean_likelihood(np.array(own)[counted])), abs=1e-7)
-    for one, column, found in zip(rest, columns, likelihood(rest, columns), strict=True):
+    assert likelihood.own[1] == pytest.approx(float(mean_likelihood(np.array(own)[counted])), abs=1e-7)
+    assert likelihood.own[0] == pytest.approx(
+        of_column(given, np.arange(12) == 10, columns[7], 0.0), abs=1e-7
+    )
+    for one, column, found in zip(rest, columns, likelihood(of, rest, columns), strict=True):
         each = np.array([of_column(given, one, column, share) for share in (0.0, ALIKE)])
         assert found == pytest.approx(float(mean_likelihood(each[counted])), abs=1e-7)
-    assert likelihood(rest[:0], columns[:0]).shape == (0,)
+    assert likelihood(of[:0], rest[:0], columns[:0]).shape == (0,)
 
 
 def test_a_prior_that_is_far_worse_for_a_set_does_not_count_for_its_images() -> None:
     """Two meters that are off by the reverse amounts: amounts alike do not count."""
     F, truth = 1e4 * np.eye(5), np.array([1.0, -1.0, 0.0, 0.0, 0.0])
     given = SearchProblem(F @ truth, F, np.ones(5), 4, np.zeros(5), np.full(5, np.inf))
-    likelihood, chosen = mirrors._Likelihood(given, truth != 0.0), truth != 0.0
-    assert likelihood.shares == (0.0,)
-    assert likelihood.own == pytest.approx(of_column(given, chosen, np.zeros(4, np.bool_), 0.0))
+    chosen = truth != 0.0
+    likelihood = mirrors._Likelihood(given, chosen[None])
+    assert likelihood.counted.tolist() == [[True], [False]]
+    assert likelihood.own[0] == pytest.approx(of_column(given, chosen, np.zeros(4, np.bool_), 0.0))
 
 
 def test_a_mirror_image_costs_as_much_as_its_set_where_readings_agree() -> None:
@@ -100,7 +105,7 @@ def test_a_mirror_image_costs_as_much_as_its_set_where_readings_agree() -> None:
     laterals[0, 5:] = True
     near = mirrors.Neighbourhoods(laterals, np.zeros((p, 1), dtype=np.bool_), p, p + np.arange(p))
     chosen = np.append(truth, False)
-    images = list(mirrors._images(given, chosen, near, NONE[: near.phases.shape[0]]))
+    (images,) = mirrors._images(given, chosen[None], near, NONE[: near.phases.shape[0]])
     assert all(more > 0.0 for _, more in images)
 
 
@@ -214,7 +219,7 @@ def test_all_others_of_a_lateral_have_an_image_within_the_promise(most: int, mas
     given = problem(3, p=8, others=1)
     laterals = (np.arange(8) < 4)[None]
     near = mirrors.Neighbourhoods(laterals, np.zeros((8, 1), dtype=np.bool_), most, 8 + np.arange(8))
-    found = mirrors._images(given, np.arange(9) == 4, near, np.arange(8) < masked)
+    (found,) = mirrors._images(given, (np.arange(9) == 4)[None], near, np.arange(8) < masked)
     images = [np.flatnonzero(one).tolist() for one, _ in found]
     assert images == ([[5, 6, 7]] if most - masked == 3 else [])
 
