@@ -104,28 +104,10 @@ def cost(problem: SearchProblem, chosen: Bools, share: float = 0.0) -> float:
     share
         As in `costs`.
     """
-    at, out = np.flatnonzero(chosen), penalty(problem, chosen)
-    if share:
-        out += float(problem.charge.max(initial=0.0))
-    if not at.size:
-        return out
-    meter = at < problem.meters
-    std = np.where(meter, sqrt(1.0 - share), 1.0) * problem.std[at]
-    A = submatrix(problem.F, at, at)
-    A[np.diag_indices(at.size)] += std**-2.0
-    half, failed = lapack.dpotrf(A.T, lower=True, overwrite_a=True, clean=False)
-    if failed:
-        raise np.linalg.LinAlgError("the information of a set is not positive definite")
-    w = np.where(meter, 1.0 / (problem.std[at] * (1.0 - share)), 0.0)
-    own, common = lapack.dtrtrs(half, np.stack([problem.y[at], w]).T, lower=True)[0].T
-    out += 2.0 * float(np.log(half.diagonal() * std).sum()) - float(own @ own)
-    if share:
-        information = np.count_nonzero(meter) / (1.0 - share) - float(common @ common)
-        out += float(common_cost(share, -float(common @ own), information))
-    return out
+    return float(_dense(problem, chosen[None], problem.std, share)[0])
 
 
-def costs(problem: SearchProblem, sets: Bools, share: float = 0.0) -> Floats:
+def costs(problem: SearchProblem, sets: Bools, share: float = 0.0, std: Floats | None = None) -> Floats:
     """Costs of some sets with a share of the meters' variance in common, (k,).
 
     The amounts have the prior covariance ``s^2 (share 1 1' + (1 - share) I)``. With a share, a set bears the
@@ -142,9 +124,11 @@ def costs(problem: SearchProblem, sets: Bools, share: float = 0.0) -> Floats:
         The sets.
     share
         Share in common, 0 to 1.
+    std : (k, q)
+        Prior standard deviations of each set; None: those of the problem.
     """
-    if len(sets) <= FEW:
-        return np.array([cost(problem, each, share) for each in sets])
+    if std is not None or len(sets) <= FEW:
+        return _dense(problem, sets, problem.std if std is None else std, share)
     meters = np.count_nonzero(sets[:, : problem.meters], axis=1)
     out = penalties(problem.meters)[meters] + (problem.charge.max(initial=0.0) if share else 0.0)
     used = np.logical_or.reduce(sets, axis=0)
@@ -160,6 +144,73 @@ def costs(problem: SearchProblem, sets: Bools, share: float = 0.0) -> Floats:
             information = meters[rows] / (1.0 - share) + base.borders[q + 1, 1] - inner[:, 1, 1]
             out[rows] += common_cost(share, score, information)
     return np.asarray(out)
+
+
+def _dense(problem: SearchProblem, sets: Bools, std: Floats, share: float) -> Floats:
+    """Costs of some sets by a Cholesky factor of each, (k,); std: (q,) or (k, q)."""
+    p, count = problem.meters, np.count_nonzero(sets[:, : problem.meters], axis=1)
+    out = penalties(p)[count] + sets @ problem.charge + (problem.charge.max(initial=0.0) if share else 0.0)
+    std = np.broadcast_to(std, sets.shape)
+    for some in similar(np.count_nonzero(sets, axis=1)):
+        at, inside = padded(sets[some])
+        size, meter = np.take_along_axis(std[some], at, axis=1), inside & (at < p)
+        own = np.where(inside, np.where(meter, sqrt(1.0 - share), 1.0) * size, 1.0)
+        rows = [problem.y[at] * inside]
+        if share:
+            rows.append(np.where(meter, 1.0 / (size * (1.0 - share)), 0.0))
+        half, n = _bordered(_definite(problem.F, at, inside, own), np.stack(rows, axis=1)), at.shape[1]
+        inner = half[:, n:, :n] @ half[:, n:, :n].transpose(0, 2, 1)
+        diagonal = np.einsum("kii->ki", half)[:, :n]
+        out[some] += 2.0 * np.log(diagonal * own).sum(axis=1) - inner[:, 0, 0]
+        if share:
+            information = count[some] / (1.0 - share) - inner[:, 1, 1]
+            out[some] += common_cost(share, -inner[:, 0, 1], information)
+    return np.asarray(out)
+
+
+def _definite(F: Floats, at: Ints, inside: Bools, std: Floats) -> Floats:
+    """``F_JJ + diag(1 / std^2)`` of some sets, (k, n, n), filled up by the identity; std: (k, n), 1 there."""
+    A, n = F[at[:, :, None], at[:, None, :]], np.arange(at.shape[1])
+    A *= inside[:, :, None] & inside[:, None, :]
+    A[:, n, n] += std**-2.0
+    return A
+
+
+def sizes(problem: SearchProblem, sets: Bools) -> Floats:
+    """Prior size of the meters' faults that suits each set, (k,); that of the problem for none of meters.
+
+    It is the root of the mean square of their posterior amounts.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    sets : (k, q)
+        The sets.
+    """
+    out = np.full(len(sets), problem.std[0])
+    for some in similar(np.count_nonzero(sets, axis=1)):
+        at, inside = padded(sets[some])
+        cov = np.linalg.inv(_definite(problem.F, at, inside, np.where(inside, problem.std[at], 1.0)))
+        mean = np.vecdot(cov, (problem.y[at] * inside)[:, None, :])
+        meter = inside & (at < problem.meters)
+        square = ((mean * mean + np.einsum("kii->ki", cov)) * meter).sum(axis=1)
+        count = np.count_nonzero(meter, axis=1)
+        out[some] = np.where(count > 0, np.sqrt(square / np.maximum(count, 1)), out[some])
+    return out
+
+
+def similar(counts: Sequence[int] | Ints) -> Iterator[Ints]:
+    """Places of similar counts together: from the least to the largest they double at most.
+
+    Parameters
+    ----------
+    counts : (k,)
+        Numbers of members.
+    """
+    doubles = np.ceil(np.log2(np.maximum(counts, SMALL)))
+    for one in np.unique(doubles):
+        yield np.flatnonzero(doubles == one)
 
 
 def with_common(problem: SearchProblem, share: float) -> tuple[SearchProblem, Floats]:
@@ -195,9 +246,8 @@ def _tableaus(
         if not which.any():
             continue
         base, rows, differ = Tableau(problem, *borders).pivot(own), np.flatnonzero(which), sets[which] ^ own
-        doubles = np.ceil(np.log2(np.maximum(np.count_nonzero(differ, axis=1), SMALL)))
-        for each in np.unique(doubles):
-            yield base, rows[doubles == each], *padded(differ[doubles == each])
+        for some in similar(np.count_nonzero(differ, axis=1)):
+            yield base, rows[some], *padded(differ[some])
 
 
 def explained(problem: SearchProblem, sets: Bools, weight: Floats, T: Floats) -> tuple[Floats, Floats]:

@@ -25,7 +25,7 @@ from scipy.cluster.hierarchy import linkage
 from scipy.special import gammaln
 
 from gridsec.arrays import Bools, Floats, Ints, frozen
-from gridsec.estimators.modal.costs import BELIEVED, SMALL, SearchProblem, informed, penalties
+from gridsec.estimators.modal.costs import BELIEVED, SearchProblem, informed, penalties, similar
 from gridsec.estimators.modal.model import Modes
 
 GAIN = 1e-9
@@ -290,12 +290,6 @@ def together(groups: Sequence[Ints]) -> Groups:
             final[row, chains[k][1]] = True
         out.append((at_, inside, final))
     return tuple(out)
-
-
-def similar(sizes: Sequence[int]) -> list[list[int]]:
-    """Places of similar sizes together."""
-    class_of = np.ceil(np.log2(np.maximum(sizes, SMALL)))
-    return [np.flatnonzero(class_of == one).tolist() for one in np.unique(class_of)]
 
 
 def filled(sets: Sequence[Ints]) -> tuple[Ints, Bools]:

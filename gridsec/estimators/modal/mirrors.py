@@ -29,7 +29,7 @@ from math import inf
 
 import numpy as np
 
-from gridsec.arrays import Bools, Floats, Ints, any_of
+from gridsec.arrays import Bools, Floats, Ints, any_of, keys_of
 from gridsec.estimators.modal.costs import SearchProblem, among, costs, informed, penalties
 from gridsec.estimators.modal.laterals import clusters, coded
 from gridsec.estimators.modal.model import Modes
@@ -92,8 +92,8 @@ def reflected(
         Explanations of an earlier search.
     """
     found_by, likelier = costs_of(found), False
-    before = set() if known is None else {each.tobytes() for each in known}
-    stays = np.array([each.tobytes() in before for each in found.chosen])
+    before = set() if known is None else set(keys_of(known))
+    stays = np.array([each in before for each in keys_of(found.chosen)])
     some = found.weight >= np.where(stays, STAYS, REFLECTED)
     for model in np.unique(found.model[some]).tolist():
         sets, cost = found.chosen[some & (found.model == model)], found_by[model]

@@ -34,19 +34,20 @@ from typing import TypeVar
 import numpy as np
 from scipy.linalg import cho_solve, lapack
 
-from gridsec.arrays import Bools, Floats, Ints
+from gridsec.arrays import Bools, Floats, Ints, keys_of, sets_of
 from gridsec.estimators.modal.alike import Alike, opposed
 from gridsec.estimators.modal.costs import (
     BELIEVED,
     SearchProblem,
     Tableau,
-    amounts,
     costs,
     informed,
     mean_amounts,
     mean_likelihood,
+    similar,
+    sizes,
 )
-from gridsec.estimators.modal.laterals import GAIN, Groups, excess, filled, in_common, similar, together
+from gridsec.estimators.modal.laterals import GAIN, Groups, excess, filled, in_common, together
 
 AnyTableau = TypeVar("AnyTableau", bound=Tableau)
 
@@ -248,9 +249,9 @@ def search(
             met = {end.chosen.tobytes(): end.cost}
             _with_amounts_alike(end.problem, met, sets[:1])
         problems.append(end.problem if known is None else _recalled(end.problem, met, known))
-        keys = list(met)
-        less = excess(np.stack([np.frombuffer(key, dtype=np.bool_) for key in keys]), whole, read)
-        found.append({key: met[key] + cost - float(one) for key, one in zip(keys, less, strict=True)})
+        less = excess(sets_of(met, end.chosen.size), whole, read)
+        each = np.fromiter(met.values(), np.float64, len(met)) + cost - less
+        found.append(dict(zip(met, each.tolist(), strict=True)))
     plain = np.frombuffer(min(found[0], key=lambda key: found[0][key]), dtype=np.bool_)
     return identified(tuple(problems), tuple(found), plain)
 
@@ -375,7 +376,7 @@ def _beside_alike(end: Alike, groups: Groups) -> Bools:
         descend(rival, groups)
         found.setdefault(rival.chosen.tobytes(), rival.whole)
     keys = sorted(found, key=lambda key: found[key])[:SOME]
-    return np.stack([np.frombuffer(key, dtype=np.bool_) for key in keys])
+    return sets_of(keys, end.chosen.size)
 
 
 def _with_amounts_alike(problem: SearchProblem, found: dict[bytes, float], more: Bools) -> None:
@@ -384,13 +385,15 @@ def _with_amounts_alike(problem: SearchProblem, found: dict[bytes, float], more:
         found.setdefault(chosen.tobytes(), float(each))
     keys = sorted(found, key=lambda key: found[key])[:SOME]
     keys = list(dict.fromkeys([*keys, *(each.tobytes() for each in more)]))
-    sets = np.stack([np.frombuffer(key, dtype=np.bool_) for key in keys])
+    sets = sets_of(keys, more.shape[1])
     found.update(
         zip(keys, mixed(problem, sets, np.array([found[key] for key in keys])).tolist(), strict=True)
     )
 
 
-def mixed(problem: SearchProblem, sets: Bools, own: Floats | None = None) -> Floats:
+def mixed(
+    problem: SearchProblem, sets: Bools, own: Floats | None = None, *, std: Floats | None = None
+) -> Floats:
     """Costs of sets with both priors of the amounts mixed, (k,): independent amounts and amounts alike.
 
     Parameters
@@ -401,11 +404,14 @@ def mixed(problem: SearchProblem, sets: Bools, own: Floats | None = None) -> Flo
         The sets; those of one meter have one prior.
     own : (k,)
         Their costs with independent amounts; None: computed here.
+    std : (k, q)
+        As in `costs`.
     """
-    out = costs(problem, sets) if own is None else own.copy()
+    out = costs(problem, sets, 0.0, std) if own is None else own.copy()
     several = np.flatnonzero(np.count_nonzero(sets[:, : problem.meters], axis=1) > 1)
     if several.size:
-        out[several] = mean_likelihood(np.stack([out[several], costs(problem, sets[several], ALIKE)]))
+        alike = costs(problem, sets[several], ALIKE, None if std is None else std[several])
+        out[several] = mean_likelihood(np.stack([out[several], alike]))
     return out
 
 
@@ -419,12 +425,15 @@ def _recalled(problem: SearchProblem, found: dict[bytes, float], known: Bools) -
     out, least = problem, min(found.values())
     known = known.copy()
     known[:, : problem.meters] &= informed(problem)
-    for chosen, shared in zip(known, mixed(problem, known), strict=True):
-        own = _sized(problem, chosen)
-        if chosen.any() and (np.abs(mean_amounts(own, chosen)) > own.bound[chosen]).any():
+    std = np.tile(problem.std, (len(known), 1))
+    std[:, : problem.meters] = sizes(problem, known)[:, None]
+    shared, suited = mixed(problem, known), mixed(problem, known, std=std)
+    both = -2.0 * np.logaddexp(log(1.0 - SUITED) - 0.5 * shared, log(SUITED) - 0.5 * suited)
+    limited = np.logical_or.reduce(known & (problem.bound < inf), axis=1)
+    for k, (chosen, cost) in enumerate(zip(known, both.tolist(), strict=True)):
+        own = replace(problem, std=std[k])
+        if limited[k] and (np.abs(mean_amounts(own, chosen)) > own.bound[chosen]).any():
             continue
-        suited = mixed(own, chosen[None])[0]
-        cost = -2.0 * float(np.logaddexp(log(1.0 - SUITED) - 0.5 * shared, log(SUITED) - 0.5 * suited))
         found[chosen.tobytes()] = min(cost, found.get(chosen.tobytes(), inf))
         if cost < least:
             out, least = own, cost
@@ -444,14 +453,10 @@ def _at(problem: SearchProblem, chosen: Bools) -> Tableau:
 
 def _sized(problem: SearchProblem, chosen: Bools) -> SearchProblem:
     """The problem with the prior size of the meters' faults estimated from a set of them."""
-    p = problem.meters
-    if not chosen[:p].any():
+    if not chosen[: problem.meters].any():
         return problem
-    mean, cov = amounts(problem, chosen)
-    count = int(np.count_nonzero(chosen[:p]))
-    size = float(np.sqrt(np.mean((mean**2 + cov.diagonal())[:count])))
     std = problem.std.copy()
-    std[:p] = size
+    std[: problem.meters] = sizes(problem, chosen[None])[0]
     return replace(problem, std=std)
 
 
@@ -490,15 +495,16 @@ def _neighbours(best: Tableau, found: dict[bytes, float], least: float = BELIEVE
     sets[np.arange(one.size), one] ^= True
     sets[rows, out[i]], sets[rows, j] = False, True
     more = np.concatenate([change[one], both[i, j]]) + best.whole
-    for chosen, each in zip(sets, more.tolist(), strict=True):
-        found.setdefault(chosen.tobytes(), each)
+    for key, each in zip(keys_of(sets), more.tolist(), strict=True):
+        found.setdefault(key, each)
 
 
 def costs_of(found: Identification) -> list[dict[bytes, float]]:
     """Costs of explanations under each model of the loads, by their bytes; the weights sum to a cost of 0."""
     out: list[dict[bytes, float]] = [{} for _ in found.problems]
-    for model, chosen, weight in zip(found.model.tolist(), found.chosen, found.weight, strict=True):
-        out[model][chosen.tobytes()] = -2.0 * float(np.log(weight))
+    each = (-2.0 * np.log(found.weight)).tolist()
+    for model, key, cost in zip(found.model.tolist(), keys_of(found.chosen), each, strict=True):
+        out[model][key] = cost
     return out
 
 
@@ -516,14 +522,15 @@ def identified(
     plain : (q,)
         As in `Identification`: no other faults are certain.
     """
-    every = sorted((each[key], k, key) for k, each in enumerate(found) for key in each)
-    costs = np.array([one for one, _, _ in every])
-    weight = np.exp(-0.5 * (costs - costs[0]))
+    every = [(cost, k, key) for k, each in enumerate(found) for key, cost in each.items()]
+    least = min(cost for cost, _, _ in every)
+    weights = np.exp(-0.5 * (np.array([cost for cost, _, _ in every]) - least))
+    kept = np.flatnonzero(weights >= BELIEVED * weights.sum()).tolist()
+    every = sorted(every[k] for k in kept)
+    weight = np.exp(-0.5 * (np.array([cost for cost, _, _ in every]) - least))
     weight /= weight.sum()
-    kept = weight >= BELIEVED
-    chosen = np.stack([np.frombuffer(key, dtype=np.bool_) for _, _, key in every])[kept]
-    weight = weight[kept] / weight[kept].sum()
-    model = np.array([k for _, k, _ in every])[kept]
+    chosen = sets_of([key for *_, key in every], problems[0].y.size)
+    model = np.array([k for _, k, _ in every])
     named = _certain(chosen, weight, plain)[: problems[0].meters]
     return Identification(chosen, model, weight, named, problems, plain)
 

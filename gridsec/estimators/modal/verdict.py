@@ -274,21 +274,21 @@ def explanations(
     owner, last = design.plant.droop.customer, design.customers
     powers, phases = core.faults.powers, design.busbar_incidence.shape[1]
     used = core.model.phases(core.modes.at).any(axis=0)
+    # Inverters with a metered reactive power, and their customers' reports.
     metered = uses_q[owner]
-    total: dict[tuple[bytes, ...], float] = {}
-    for chosen, weight in zip(found.chosen, found.weight, strict=True):
-        inverters, wrong = chosen[p + last : p + powers], chosen[p : p + last].copy()
-        wrong[owner[inverters & metered]] = True
-        busbar = np.zeros(phases, dtype=np.bool_)
-        busbar[used] = chosen[p + powers :]
-        each = (chosen[:p], inverters & ~metered, wrong, busbar)
-        key = tuple(one.tobytes() for one in each)
-        total[key] = total.get(key, 0.0) + float(weight)
-    likely = sorted(((w, key) for key, w in total.items() if w >= LIKELY), key=lambda each: -each[0])
+    inverters, wrong = found.chosen[:, p + last : p + powers], found.chosen[:, p : p + last].copy()
+    wrong[:, owner[metered]] |= inverters[:, metered]
+    busbar = np.zeros((len(wrong), phases), dtype=np.bool_)
+    busbar[:, used] = found.chosen[:, p + powers :]
+    every = np.hstack([found.chosen[:, :p], inverters & ~metered, wrong, busbar])
+    _, first, which = np.unique(np.packbits(every, axis=1), axis=0, return_index=True, return_inverse=True)
+    total = np.bincount(which.ravel(), found.weight)
+    likely = sorted((k for k in np.flatnonzero(total >= LIKELY)), key=lambda k: (-total[k], first[k]))
+    parts = np.cumsum([p, owner.size, last])
     out = []
-    for weight, key in likely[:SHOWN]:
-        meters, inverters, wrong, busbar = (np.frombuffer(one, dtype=np.bool_) for one in key)
-        out.append(Explanation(meters, inverters, weight, wrong, busbar))
+    for k in likely[:SHOWN]:
+        meters, inverters, wrong, busbar = np.split(every[first[k]], parts)
+        out.append(Explanation(meters, inverters, float(total[k]), wrong, busbar))
     return tuple(out)
 
 
