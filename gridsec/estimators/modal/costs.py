@@ -138,7 +138,7 @@ def costs(problem: SearchProblem, sets: Bools, share: float = 0.0, std: Floats |
         log_det, inner = base.block(at, inside)
         sign = np.where(base.chosen[at], -1.0, 1.0) * inside
         out[rows] += base.cost - base.penalty[base.count] + log_det - inner[:, 0, 0]
-        out[rows] += (sign * (base.size + problem.charge)[at]).sum(axis=1)
+        out[rows] += (sign * base.weight[at]).sum(axis=1)
         if share:
             score = inner[:, 0, 1] - base.borders[q, 1]
             information = meters[rows] / (1.0 - share) + base.borders[q + 1, 1] - inner[:, 1, 1]
@@ -405,6 +405,7 @@ class Tableau:
         # Number of chosen meters.
         self.cost, self.count = 0.0, 0
         self.size = 2.0 * np.log(problem.std)
+        self.weight, self.bounded = self.size + problem.charge, np.flatnonzero(problem.bound < inf)
 
     def pivot(self, chosen: Bools) -> Self:
         """The same, pivoted on a set in place of none; O(q k^2).
@@ -445,6 +446,7 @@ class Tableau:
         """A tableau that can be changed without changing this one."""
         out = object.__new__(type(self))
         out.problem, out.penalty, out.size = self.problem, self.penalty, self.size
+        out.weight, out.bounded = self.weight, self.bounded
         out.rows, out.prior, out.order = self.rows, self.prior, self.order
         out.columns, out.diagonal = self.columns.copy(order="F"), self.diagonal.copy()
         out.chosen, out.barred = self.chosen.copy(), self.barred.copy()
@@ -492,17 +494,18 @@ class Tableau:
 
     def changes(self) -> Floats:
         """Change of the cost by toggling each fault, (q,); inf where it is barred or would be impossible."""
-        a = self.diagonal
-        out, v = self.steps()
-        impossible = ~self.chosen & (np.abs(v) > self.problem.bound * np.abs(a))
-        sign = np.where(self.chosen, -1.0, 1.0)
-        return np.where(impossible | (self.barred & ~self.chosen) | (sign * a <= 0.0), inf, out)
+        (out, v), a, b = self.steps(), self.diagonal, self.bounded
+        out[(self.barred & ~self.chosen) | ((a <= 0.0) != self.chosen)] = inf
+        impossible = ~self.chosen[b] & (np.abs(v[b]) > self.problem.bound[b] * np.abs(a[b]))
+        out[b[impossible]] = inf
+        return out
 
     def steps(self) -> tuple[Floats, Floats]:
         """Change of the cost by toggling each fault, and its amount times its pivot, (q,)."""
         k, p, a, v = self.count, self.problem.meters, self.diagonal, self.columns[: self.chosen.size, 0]
-        sign = np.where(self.chosen, -1.0, 1.0)
-        out = np.log(np.abs(a)) + sign * (self.size + self.problem.charge) - v * v / a
+        out = np.log(np.abs(a))
+        out += np.where(self.chosen, -self.weight, self.weight)
+        out -= v * v / a
         up = self.penalty[min(k + 1, p)] - self.penalty[k]
         down = self.penalty[max(k - 1, 0)] - self.penalty[k]
         out[:p] += np.where(self.chosen[:p], down, up)
@@ -540,10 +543,10 @@ class Tableau:
         rows = own / a[out][:, None]
         pivot = a - rows * own
         pull = v - rows * v[out][:, None]
-        first = -(v[out] ** 2) / a[out] + np.log(-a[out]) - self.size[out] - self.problem.charge[out]
+        first = -(v[out] ** 2) / a[out] + np.log(-a[out]) - self.weight[out]
         sign, meter = np.where(self.chosen, -1, 1), np.arange(q) < p
         both = first[:, None] - pull**2 / pivot + np.log(np.abs(pivot))
-        both += sign * (self.size + self.problem.charge)
+        both += sign * self.weight
         count = k - meter[out][:, None] + sign * meter
         both += self.penalty[np.minimum(count, p)] - self.penalty[k]
         return both, pull, pivot
