@@ -87,6 +87,8 @@ RECALLED = 24
 """Largest number of explanations that the next search knows, 1."""
 CALM = 0.5
 """Part of the limit of log M below which suspected onsets are given up, 1."""
+LAST_THIRD = 3
+"""Age of a ramp over that of the step that fits it best, 1."""
 EARLY = 64
 """Ticks that are all compared with the classes, and later those from one comparison to the next."""
 
@@ -364,12 +366,16 @@ def step(  # noqa: PLR0917  # the state, and one tick
 
 
 def _pins(onsets: Onsets, rows: Ints, age: int) -> Ints:
-    """Rows to pin: the likeliest ones, and the ramp with about the age of the earliest suspected onset."""
-    ramps = np.flatnonzero(onsets.used & onsets.ramp)
-    if not ramps.size or age <= onsets.age[rows].max():
+    """Rows to pin: the likeliest ones, and the ramp with about the age of the earliest suspected onset.
+
+    The step that fits a ramp best begins after two thirds of it.
+    """
+    ramps, first = np.flatnonzero(onsets.used & onsets.ramp), rows[0]
+    age = max(age, int(onsets.age[first]) * (1 if onsets.ramp[first] else LAST_THIRD))
+    if not ramps.size or onsets.ramp[rows].any():
         return rows
-    oldest = ramps[np.abs(onsets.age[ramps] - age).argmin()]
-    return rows if oldest in rows else np.append(rows[:-1], oldest)
+    oldest = ramps[np.abs(np.log(onsets.age[ramps] / age)).argmin()]
+    return np.append(rows[:-1], oldest)
 
 
 def mask(core: Core, state: CoreState, suspicion: Suspicion) -> tuple[CoreState, Evidence]:

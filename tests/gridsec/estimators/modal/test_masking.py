@@ -123,19 +123,22 @@ def test_meters_are_masked_from_the_earliest_suspected_onset_on(kernel: Core) ->
     assert state.first == len(state.history.readings)
 
 
-def test_a_long_suspected_ramp_stays_a_candidate(kernel: Core) -> None:
-    """Its onset is pinned beside the likeliest ones, where these are younger."""
+def test_a_ramp_of_the_suspected_age_is_a_candidate(kernel: Core) -> None:
+    """Its age is that of the earliest suspicion, or three times that of the likeliest step."""
     source, state = Source(MODEL, np.random.default_rng(1)), core.init(kernel, 0.0)
     for k in range(100):
         state, evidence = core.step(kernel, state, float(k), source.tick())
     onsets, rows = state.detector.onsets, np.flatnonzero(state.detector.onsets.used)
     young = rows[np.argsort(onsets.age[rows])][: evidence.rows.size]
-    pins = core._pins(onsets, young, 70)
-    assert pins[:-1].tolist() == young[:-1].tolist()
     ramps = rows[onsets.ramp[rows]]
-    assert onsets.ramp[pins[-1]]
-    assert abs(onsets.age[pins[-1]] - 70) == np.abs(onsets.age[ramps] - 70).min()
-    assert core._pins(onsets, young, 1) is young
+    assert not onsets.ramp[young].any()
+    for age, first in ((70, young), (1, rows[onsets.age[rows] > 20][:3])):
+        pins, likely = core._pins(onsets, first, age), max(age, 3 * int(onsets.age[first[0]]))
+        assert pins[:-1].tolist() == first[:-1].tolist()
+        assert onsets.ramp[pins[-1]]
+        apart = np.abs(np.log(onsets.age[ramps] / likely))
+        assert apart[ramps == pins[-1]] == apart.min()
+    pins = core._pins(onsets, young, 70)
     # A ramp that is pinned anyway takes the place of no other onset.
     with_ramp = np.concatenate([pins[-1:], young[:-1]])
     assert core._pins(onsets, with_ramp, 70) is with_ramp
