@@ -147,6 +147,7 @@ def test_peers_are_compared_in_the_snapshots_that_both_have_seen(tmp_path: Path)
 _OPEN = pytest.mark.xfail(reason="`modal` leaves a false report beside false voltages open")
 
 
+@pytest.mark.canary("6")
 @pytest.mark.parametrize("trial", [0, 3, 6])
 def test_honest_meters_that_contradict_a_false_power_are_not_accused_for_being_many(trial: int) -> None:
     """Three of thirteen tell of a load that one of them reports; ten were accused once, being no dearer."""
@@ -155,6 +156,7 @@ def test_honest_meters_that_contradict_a_false_power_are_not_accused_for_being_m
     np.testing.assert_array_equal(suspects(scene(FEEDER), told), told.liars)
 
 
+@pytest.mark.canary("rural3-behind-3-17")
 @pytest.mark.parametrize(
     ("feeder", "liars", "trial"),
     [

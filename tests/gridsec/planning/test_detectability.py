@@ -283,6 +283,7 @@ def test_thresholds_equal_enumeration(seed: int) -> None:
     assert none.undetected == none.unavoidable == 0.0
 
 
+@pytest.mark.canary("1")
 @pytest.mark.parametrize("seed", range(3))
 def test_the_core_agrees_with_thresholds(seed: int) -> None:
     """A step of *undetected* leaves its own M below gamma at all ages, and one of *found* does not."""

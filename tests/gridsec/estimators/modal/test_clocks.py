@@ -70,6 +70,7 @@ def test_boilers_that_are_switched_together_name_no_meter(seed: int, count: int,
     assert not np.any([each.suspects for each in scene.watch(200, boilers)])
 
 
+@pytest.mark.canary("0-1-0.02", "1--1-0.02")
 @pytest.mark.parametrize(("shift", "step"), [(-1, 0.005), (-1, 0.02), (1, 0.005), (1, 0.02)])
 @pytest.mark.parametrize("seed", range(4))
 def test_a_meter_with_a_clock_within_half_a_tick_is_not_named(shift: int, step: float, seed: int) -> None:
@@ -93,6 +94,7 @@ def test_a_meter_with_a_clock_within_half_a_tick_is_not_named(shift: int, step: 
         assert not verdict.suspects.any()
 
 
+@pytest.mark.canary("customers0")
 @pytest.mark.parametrize("customers", [(6,), (6, 8)])
 def test_metered_reactive_powers_of_another_moment_name_no_meter(customers: tuple[int, ...]) -> None:
     """12 kW with a power factor that changes each minute, at customers with clocks that are ahead."""
@@ -106,6 +108,7 @@ def test_metered_reactive_powers_of_another_moment_name_no_meter(customers: tupl
     assert not np.any([each.suspects for each in scene.watch(200, factors)])
 
 
+@pytest.mark.canary("0.015")
 @pytest.mark.parametrize("size", [0.015, 0.02])
 def test_a_load_that_cycles_behind_an_offset_hides_no_lasting_manipulation(size: float) -> None:
     """0.6 kW for 2 s of 4 s at meter 3, with a clock that is ahead; meter 10 is off by `size`."""
@@ -121,6 +124,7 @@ def test_a_load_that_cycles_behind_an_offset_hides_no_lasting_manipulation(size:
     assert not np.any([np.delete(each.suspects, 10) for each in out])
 
 
+@pytest.mark.canary("2")
 @pytest.mark.parametrize("period", [1, 2, 4, 8])
 def test_an_offset_of_another_meter_delays_no_name_beyond_its_loads(period: int) -> None:
     """Meter 9 is off by 3 % with signs that alternate; no load of meter 3 explains as much."""

@@ -206,6 +206,7 @@ def test_an_inverter_off_its_curve_is_named_until_it_follows_it_again() -> None:
     assert after[-1][1].decision is Decision.CLEAN
 
 
+@pytest.mark.canary("1.0")
 @pytest.mark.parametrize("busbar", [0.0, 1.0])
 def test_meters_without_errors_and_a_busbar_that_says_nothing(busbar: float) -> None:
     """Two perfect meters at one bus, and a class of 100 %: limits are numbers, and what lies is seen."""

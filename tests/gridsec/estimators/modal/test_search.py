@@ -47,7 +47,7 @@ def total(given: SearchProblem, chosen: Bools) -> float:
     return 2.0 * (np.log(2.0) - np.logaddexp(-0.5 * one, -0.5 * costs(given, chosen[None], s.ALIKE)[0]))
 
 
-@pytest.mark.canary("0-0", "2-0", "3-7")
+@pytest.mark.canary("3-7")
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("liars", [0, 1, 2, 3])
 def test_the_best_set_is_that_of_brute_force(seed: int, liars: int) -> None:
