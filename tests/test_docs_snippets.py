@@ -56,9 +56,11 @@ def blocks(page: str) -> list[tuple[str, str, str | None]]:
 
 PAGES = ("your-own-system.md", "theory-distributed.md")
 EVERY = [pytest.param(code, out, id=head) for page in PAGES for head, code, out in blocks(page)]
+SLOW = "High-gain observers for a system written in sympy"
 MODULE, WATCH = blocks("your-own-estimator.md")
 
 
+@pytest.mark.canary(*(str(one.id) for one in EVERY if one.id != SLOW))
 @pytest.mark.parametrize(("code", "printed"), EVERY)
 def test_a_block_prints_what_stands_below_it(code: str, printed: str | None) -> None:
     out = io.StringIO()

@@ -42,18 +42,19 @@ LOW_VOLTAGE = (
 )
 
 
-@pytest.mark.canary("kerber-dorfnetz-12")
+@pytest.mark.canary("kerber-dorfnetz-12-1.5")
 @pytest.mark.parametrize(
-    ("feeder", "hour"),
+    ("feeder", "hour", "hours"),
     # The large ones take their time: a night or an afternoon each.
-    [
-        (name, hour)
+    [("kerber-dorfnetz", 12, 1.5)]
+    + [
+        (name, hour, 6.0)
         for k, name in enumerate(LOW_VOLTAGE)
         for hour in (0, 12)
         if k % 2 == hour // 12 or len(load(name).meters) < LARGE
     ],
 )
-def test_a_day_without_an_attack_raises_no_alarm(feeder: str, hour: int) -> None:
+def test_a_day_without_an_attack_raises_no_alarm(feeder: str, hour: int, hours: float) -> None:
     """A night and an afternoon, each from another season and day of the profiles and with other meters."""
     tables = load(feeder).tables
     tick_s = LARGE_TICK_S if len(tables.customers) > LARGE else SMALL_TICK_S
@@ -63,7 +64,7 @@ def test_a_day_without_an_attack_raises_no_alarm(feeder: str, hour: int) -> None
     day = hour // 6 + 4 * LOW_VOLTAGE.index(feeder) % 10
     scenario = Scenario(
         seed=1000 + hour,
-        duration_s=DAY_S / 4,
+        duration_s=3600.0 * hours,
         dt_s=settings.tick_s,
         profile_s=day * DAY_S + hour * 3600.0,
         season=season,
@@ -88,17 +89,19 @@ def test_a_day_without_an_attack_raises_no_alarm(feeder: str, hour: int) -> None
             true = truth[report.t][site.meters[site.meter_ids.index(str(alarm.meter))]]
             limits = tables.meta.limits
             assert not limits.v_min_pu <= true <= limits.v_max_pu, f"{alarm}: the truth is {true} pu"
-    assert ticks == DAY_S / 4 / settings.tick_s
+    assert ticks == 3600.0 * hours / settings.tick_s
 
 
-def test_a_meter_at_the_edge_of_its_class_is_learned_and_not_named() -> None:
+@pytest.mark.canary("30.0")
+@pytest.mark.parametrize("tick_s", [10.0, 30.0])
+def test_a_meter_at_the_edge_of_its_class_is_learned_and_not_named(tick_s: float) -> None:
     """The busbar's meter is off by its class one way, m05 by its class the other way, for ever.
 
     Nobody draws or generates anything. Taken for their own, what all meters seem to be off would leave m05
     outside its class.
     """
     tables = load("cigre-lv").tables
-    settings = replace(tables.meta.monitor, tick_s=10.0, silence_s=60.0, commission_s=DAY_S / 4)
+    settings = replace(tables.meta.monitor, tick_s=tick_s, silence_s=60.0, commission_s=DAY_S / 4)
     site = from_tables(replace(tables, meta=replace(tables.meta, monitor=settings)))
     nominal, p, random = tables.meta.voltage_volt, len(site.meter_ids), np.random.default_rng(0)
     off = np.where(np.array(site.meter_ids) == "m05", site.accuracy.class_fraction, 0.0)
@@ -108,9 +111,9 @@ def test_a_meter_at_the_edge_of_its_class_is_learned_and_not_named() -> None:
     for k in range(1, int(1.2 * settings.commission_s / settings.tick_s)):
         v = nominal * (1.0 + off + site.accuracy.jitter * random.standard_normal(p))
         v0 = nominal * (1.0 - site.accuracy.busbar_class)
-        frame = to_frame(site, Snapshot(10.0 * k, v, np.zeros(p), np.full(p, np.nan), v0))
+        frame = to_frame(site, Snapshot(tick_s * k, v, np.zeros(p), np.full(p, np.nan), v0))
         state, _, verdict = watcher.step(state, frame)
-        assert k < 12 or verdict.decision is Decision.CLEAN, f"{10 * k} s: {verdict}"
+        assert k < 12 or verdict.decision is Decision.CLEAN, f"{tick_s * k} s: {verdict}"
     assert watcher.bias_learning.commission(state).learning is None
 
 

@@ -32,6 +32,7 @@ def tapped(name: str) -> Site:
     return from_tables(replace(tables, lines=tuple(lines)))
 
 
+@pytest.mark.canary("kerber-landnetz")
 @pytest.mark.parametrize("name", ["kerber-landnetz", "ieee-european-lv"])
 def test_the_liars_behind_a_tap_are_named_in_volts(name: str, tmp_path: Path) -> None:
     site = tapped(name)

@@ -230,17 +230,20 @@ def moment(seed: int, rng: np.random.Generator, **how: float) -> Scenario:
     return Scenario(seed=seed, start=MONDAYS[season] + into, profile_s=into, season=season, **how)
 
 
-@pytest.mark.canary("rural1")
+@pytest.mark.canary("12-rural1")
 @pytest.mark.parametrize(("site", "gain"), [(CIGRE, 0.95), (RURAL, 0.75)], ids=["cigre", "rural1"])
-def test_forecasts_make_reconstructions_better_and_say_how_good_they_are(site: Site, gain: float) -> None:
-    """Three meters removed, forty moments of four seasons, each with meters and loads of its own.
+@pytest.mark.parametrize("count", [12, 40])
+def test_forecasts_make_reconstructions_better_and_say_how_good_they_are(
+    site: Site, gain: float, count: int
+) -> None:
+    """Three meters removed, moments of four seasons, each with meters and loads of its own.
 
     Ten seconds: before the observer has settled, injections are unknown, and the verdict is `settling`.
     """
     wise, rng = forecasting(site), np.random.default_rng(1)
     watchers = [(design(each), each) for each in (site, wise)]
     off, ratios = list[Floats](), list[Floats]()
-    for scenario in [moment(seed, rng, duration_s=10.0) for seed in range(40)]:
+    for scenario in [moment(seed, rng, duration_s=10.0) for seed in range(count)]:
         for watcher, each in watchers:
             error, ratio, named = watched(watcher, each, scenario)
             assert not named
@@ -368,14 +371,16 @@ def test_promises_of_studies_hold_whatever_is_forecast() -> None:
     assert (unread(FORECAST).p_error <= half.load_peak + half.pv_peak).all()
 
 
-def test_smaller_lies_are_found_and_the_monitor_keeps_what_is_promised() -> None:
+@pytest.mark.canary("3")
+@pytest.mark.parametrize("trials", [3, 12])
+def test_smaller_lies_are_found_and_the_monitor_keeps_what_is_promised(trials: int) -> None:
     """Before errors are learned, injections of inverters without a meter decide in place of forecasts."""
     wise, plain = (detectable(site, max_attacked=1) for site in (FORECAST, CIGRE))
     # The first meter is near the busbar, and no load is known to move it.
     assert (wise.meters["found"] < plain.meters["found"])[1:].all()
     assert (wise.meters["found"] < plain.meters["found"] * (1 + 1e-3)).all()
     assert (wise.customers["error"] < plain.customers["error"]).all()
-    assert rehearse(FORECAST, wise, trials=12, seed=2) == Rehearsal(12, 0, 0, 0)
+    assert rehearse(FORECAST, wise, trials=trials, seed=2) == Rehearsal(trials, 0, 0, 0)
 
 
 # -------------------------------------------------------------------------------------------- from history

@@ -44,7 +44,7 @@ def named(name: str, liar: int, power_kw: float) -> set[int]:
     return found
 
 
-@pytest.mark.canary("2-0.99", "3-0.9", "4-0.9", "5-0.6", "0-0.4", "0-0.99", "1-0.99", "2-0.9")
+@pytest.mark.canary("0-0.99", "3-0.9", "0-0.4")
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("liar", range(6))
 def test_one_false_register_names_no_honest_meter(liar: int, size: float) -> None:

@@ -93,6 +93,7 @@ def test_liars_are_named_and_their_voltages_reconstructed() -> None:
     assert frames[0].t == START
 
 
+@pytest.mark.canary("factor0")
 @pytest.mark.parametrize("factor", [(1.02, 1.03), (0.98, 1.0)])
 def test_false_readings_of_one_tick_are_seen_and_forgiven(factor: tuple[float, float]) -> None:
     """Two meters or one: no transition takes the evidence of the tick away, and no other meter is named."""

@@ -32,7 +32,7 @@ class Reporting(World):
         return replace(super().snapshot(lies), q_kvar=net + wrong * error)
 
 
-@pytest.mark.canary("900.0-simbench-lv-rural1", "1.0-cigre-lv")
+@pytest.mark.canary("1.0-cigre-lv", "900.0-cigre-lv")
 @pytest.mark.parametrize("name", WITH_INVERTERS)
 @pytest.mark.parametrize("step_s", [1.0, 900.0])
 def test_honest_errors_at_their_ends_never_accuse_an_inverter(name: str, step_s: float) -> None:
@@ -68,6 +68,7 @@ def off_their_curves(count: int, liar: int | None) -> tuple[Site, set[int], Verd
     return site, owners, verdict
 
 
+@pytest.mark.canary("2-None", "2-2")
 @pytest.mark.parametrize(("count", "liar"), [(1, 2), (2, None), (2, 2)])
 def test_the_default_names_an_inverter_and_tells_of_the_other(count: int, liar: int | None) -> None:
     """The voltages decide for one of two inverters."""

@@ -256,6 +256,7 @@ class TestConfirmation:
         assert Decision.CLEAN not in {verdict.decision for _, verdict in answers}
         assert (answers[-1][1].decision, who(answers[-1][1].suspects)) == (Decision.ATTACKED, (7,))
 
+    @pytest.mark.canary("0-match", "0-least_squares", "2-fewest", "1-pursue")
     @pytest.mark.parametrize("seed", range(3))
     def test_a_false_reading_does_not_move_the_model_of_long_ticks(self, decoder: Decoder, seed: int) -> None:
         """A quarter of an hour between readings: the inverter of the false meter would follow it at once."""
@@ -366,6 +367,7 @@ class TestUndecided:
         _, answers = watch(street, design, 12, state=state)
         assert answers[-1][1].decision is Decision.CLEAN
 
+    @pytest.mark.canary("-0.01-least_squares", "0.01-fewest", "0.03-match", "-0.03-pursue")
     @pytest.mark.parametrize("part", [-0.03, -0.01, 0.01, 0.03])
     def test_a_false_busbar_reading_names_no_meter(self, decoder: Decoder, part: float) -> None:
         street, design, state = settled(decoder, 5)

@@ -275,6 +275,7 @@ SAME = np.full(P, 0.004**2)
 MIXED = np.array([1.0, 1.0, 30.0, 1.0, 1.0, 5.0, 1.0]) ** 2 * SAME
 
 
+@pytest.mark.canary("noise0")
 @pytest.mark.parametrize("noise", [SAME, MIXED])
 def test_no_more_clean_snapshots_name_somebody_than_allowed(noise: Floats) -> None:
     for rate in (0.05, 0.005):

@@ -113,6 +113,7 @@ def test_a_window_names_the_liar_at_its_end(rule: Rule) -> None:
     assert answers[-1][1].decision is Decision.CLEAN
 
 
+@pytest.mark.canary("cigre-lv")
 @pytest.mark.parametrize("feeder", ["cigre-lv", "simbench-lv-rural1"])
 def test_exactly_the_liar_is_named_on_a_real_feeder(feeder: str) -> None:
     site = choose(load(feeder), estimator="windowed-bank")

@@ -144,6 +144,7 @@ def test_smallest_theta_separates_good_from_bad() -> None:
     assert smallest_theta(bad) == np.inf
 
 
+@pytest.mark.canary("0", "2", "4")
 @pytest.mark.parametrize("seed", range(6))
 def test_the_inequality_holds_at_every_theta_above_the_smallest(seed: int) -> None:
     """Also where a range leaves zero out: the eigenvalues at corners and random slopes, on a fine grid."""

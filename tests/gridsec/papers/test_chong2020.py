@@ -64,6 +64,7 @@ class TestSetting:
         expected = -2.0 * (main * (np.minimum(i[:, None], i) + 1) + drop * np.eye(4))
         np.testing.assert_allclose(of.lure.H, expected, rtol=1e-12)
 
+    @pytest.mark.canary("direct")
     @both
     def test_the_run_against_the_bank_of_the_service(self, of: Design) -> None:
         """The same banks, held readings, small steps: `bank.step` follows the continuous-time run."""

@@ -217,12 +217,14 @@ def alarms(kernel: Core, honest: Floats, step: Floats) -> Bools:
     return np.array([watched(kernel, m, step, QUIET)[-1].detector.log_m >= kernel.limit for m in honest])
 
 
+@pytest.mark.canary("40-2")
 @pytest.mark.parametrize("liars", [1, 2])
-def test_hidden_steps_stay_hidden_and_noticed_ones_do_not(liars: int) -> None:
+@pytest.mark.parametrize("count", [40, 200])
+def test_hidden_steps_stay_hidden_and_noticed_ones_do_not(count: int, liars: int) -> None:
     """Gaussian errors of the model, at the moment for which both are stated."""
     kernel = made(0)
     (tests,) = few(kernel)
-    honest = draws(kernel, np.random.default_rng(3), QUIET + SINCE, 200)
+    honest = draws(kernel, np.random.default_rng(3), QUIET + SINCE, count)
     norm = hidden_norm(1.0, 1.0, RISK)
     step = hidden_step(tests.information, 0, liars, norm)
     assert step @ tests.information @ step == pytest.approx(norm**2)
@@ -283,6 +285,7 @@ def test_thresholds_equal_enumeration(seed: int) -> None:
     assert none.undetected == none.unavoidable == 0.0
 
 
+@pytest.mark.canary("1")
 @pytest.mark.parametrize("seed", range(3))
 def test_the_core_agrees_with_thresholds(seed: int) -> None:
     """A step of *undetected* leaves its own M below gamma at all ages, and one of *found* does not."""

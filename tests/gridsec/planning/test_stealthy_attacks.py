@@ -57,6 +57,7 @@ def test_largest_lies_equal_enumeration(seed: int) -> None:
             assert worst.size == pytest.approx(tried(box, box.effect[i], liars, honest, None), rel=1e-5)
 
 
+@pytest.mark.canary("2", "9")
 @pytest.mark.parametrize("seed", range(10))
 def test_the_largest_lie_does_fit_to_an_honest_feeder(seed: int) -> None:
     """Two honest feeders at opposite ends of the unknowns: the lies turn one's readings into the other's."""

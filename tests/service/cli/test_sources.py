@@ -42,6 +42,7 @@ def written(source: str, folder: Path) -> Path:
     )
 
 
+@pytest.mark.canary("town.dss", "grid.json")
 @pytest.mark.parametrize("source", ["my-net.json", "town.dss", "grid.json"])
 def test_a_study_of_another_tools_file(
     source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -206,6 +207,7 @@ def test_a_report_tells_what_was_not_carried_over(
     assert f"gridsec study report {file}" in text_of(html)
 
 
+@pytest.mark.canary("protect", "campaign", "compare")
 @pytest.mark.parametrize(
     ("more", "study"),
     [

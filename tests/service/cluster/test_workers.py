@@ -225,6 +225,7 @@ def test_a_flood_of_forged_calls_has_one_line_of_the_log(line: Line) -> None:
     assert StateCalls(Workers(), Caller(line.ask, line.envelope())).ask_blocking("w0")
 
 
+@pytest.mark.canary("0.0-0.25", "0.015-0.5")
 @pytest.mark.parametrize(
     ("cost_s", "interval_s"), [(0.0, GATHER_S), (0.5 * SHARE, 0.5), (1.0, LONGEST_S)], ids=str
 )

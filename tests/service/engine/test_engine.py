@@ -72,6 +72,7 @@ def test_alarms_are_stored_before_they_are_published(site: Site, attacked: list[
         assert len(outlet.estimates) >= 39
 
 
+@pytest.mark.canary("0.0")
 @pytest.mark.parametrize("late_s", [0.0, 30.0])
 def test_a_backlog_makes_no_tick_blind(site: Site, attacked: list[Sample], path: Path, late_s: float) -> None:
     """The service has fallen behind: of all that arrived each round takes a part, at a much later time."""

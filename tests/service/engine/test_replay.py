@@ -42,6 +42,7 @@ def scenario(site: Site) -> Scenario:
     return Scenario(seed=5, start=START, duration_s=90.0, attacks=attacks, channel=ROUGH)
 
 
+@pytest.mark.canary("profiles")
 @pytest.mark.parametrize("forecast", ["none", "profiles"])
 def test_the_live_rounds_and_a_replay_agree_to_the_last_bit(
     site: Site, scenario: Scenario, tmp_path: Path, forecast: str
@@ -156,6 +157,7 @@ def test_bad_readings_of_a_recording_are_counted(site: Site, scenario: Scenario)
     assert [r.report.t for r in results] == [START + k for k in range(10)]
 
 
+@pytest.mark.canary("60")
 @pytest.mark.parametrize("back", [60, 1])
 def test_a_defect_ends_a_replay_also_at_its_last_tick(
     site: Site, scenario: Scenario, monkeypatch: pytest.MonkeyPatch, back: int

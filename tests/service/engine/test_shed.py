@@ -186,6 +186,7 @@ def test_rare_states_of_a_shed_feeder_are_not_stale(pair: Pair) -> None:
     assert monitor.stale(monitor.patience_s + 0.1)
 
 
+@pytest.mark.canary("29")
 @pytest.mark.parametrize("rest_s", [16, 29, 44])
 def test_the_return_of_a_shed_feeder_is_one_tick_without_silence(pair: Pair, rest_s: int) -> None:
     pair.run(14)

@@ -47,6 +47,7 @@ def played(
     return out
 
 
+@pytest.mark.canary("1--0.8", "5-3.0")
 @pytest.mark.parametrize("offset", [-2.0, -0.8, 0.8, 3.0])
 @pytest.mark.parametrize("batch", [1, 5])
 def test_one_clock_that_is_off_is_measured(offset: float, batch: int) -> None:

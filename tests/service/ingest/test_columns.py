@@ -235,6 +235,7 @@ def arrivals(r: random.Random, tick_s: float) -> list[list[tuple[float, Reading]
     return rounds
 
 
+@pytest.mark.canary("0-events", "2-wall", "3-events", "5-wall")
 @pytest.mark.parametrize("clock", list(Clock))
 @pytest.mark.parametrize("seed", range(6))
 def test_columns_align_as_one_reading_after_the_other(clock: Clock, seed: int) -> None:

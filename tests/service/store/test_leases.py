@@ -134,6 +134,7 @@ def test_one_worker_holds_all(join: Join) -> None:
     assert set(worker.owners()) == set(range(SHARDS))
 
 
+@pytest.mark.canary("2")
 @pytest.mark.parametrize("seed", range(3))
 def test_weights_are_even_and_each_shard_has_one_owner(join: Join, seed: int) -> None:
     random = Random(seed)

@@ -58,6 +58,7 @@ def test_a_write_notices_the_loss_before_the_heartbeat(cluster: Cluster) -> None
         assert store.active() == []
 
 
+@pytest.mark.canary("immediate")
 @pytest.mark.postgresql
 @pytest.mark.parametrize("mode", ["fast", "immediate"])
 def test_a_restart_of_the_server_is_no_loss(cluster: Cluster, mode: str) -> None:

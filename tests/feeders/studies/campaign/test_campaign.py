@@ -178,6 +178,7 @@ def test_lies_behind_taps_are_those_of_the_full_play(site: Site) -> None:
 def test_kinds_of_a_campaign_are_those_of_the_simulation() -> None:
     kinds = (AttackClass("power", AttackKind.POWER, (2.0,)), AttackClass("random", AttackKind.RANDOM, (2.0,)))
     plan = replace(PLAN, scenes=1, together=6, kinds=kinds, liars=(2,), places=(Place.RANDOM,))
+    plan = replace(plan, alarms_per_year=(1.0,))
     honest = plan.trial(SITE, plan.moment(0)).scenario
     seen = set()
     for case in (case for case in plan.cases(0) if case.kind != CLEAN):

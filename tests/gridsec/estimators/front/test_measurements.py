@@ -121,14 +121,17 @@ def test_a_step_beyond_the_class_may_be_a_tick_apart_without_an_offset() -> None
     assert update_skew(made, None, None, of(0.3 * step), v2 + step, last=last) is not None
 
 
-@pytest.mark.parametrize("largest_s", [0.3, 0.45])
-def test_tap_steps_accuse_no_meter_with_a_clock_within_half_a_second(largest_s: float) -> None:
+@pytest.mark.canary("0.45-240-1")
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("largest_s", "duration_s"), [(0.3, 360), (0.45, 360), (0.45, 240)])
+def test_tap_steps_accuse_no_meter_with_a_clock_within_half_a_second(
+    largest_s: float, duration_s: int, seed: int
+) -> None:
     """Offsets that are not measured; a third that is manipulated at the end is named."""
-    for seed in (0, 1):
-        seen, _ = run(seed, 360, TAP_PU, largest_s, measured=True)
-        assert seen["honest"] == 0
-        assert seen["named"] == seen["liars"]
-        assert seen[Decision.CLEAN] > 0.95 * seen["ticks"]
+    seen, _ = run(seed, duration_s, TAP_PU, largest_s, measured=True)
+    assert seen["honest"] == 0
+    assert seen["named"] == seen["liars"] > 0
+    assert seen[Decision.CLEAN] > 0.95 * seen["ticks"] > 0.0
 
 
 def test_all_clocks_off_and_a_still_feeder_is_clean_and_liars_are_named() -> None:

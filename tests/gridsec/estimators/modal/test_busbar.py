@@ -106,6 +106,7 @@ class TestStreets:
         _, answers = watch(Street(plant, rng, extreme=True), prepare(plant), 60)
         assert not any(verdict.busbar.any() or verdict.suspects.any() for _, verdict in answers)
 
+    @pytest.mark.canary("0.004")
     @pytest.mark.parametrize("part", [0.004, -0.004])
     def test_a_step_within_the_classes_of_the_meters_is_its_own(self, part: float) -> None:
         road, design = make(7)
@@ -173,6 +174,7 @@ class TestStreets:
 
 
 class TestPhases:
+    @pytest.mark.canary("3")
     @pytest.mark.parametrize("most", [3, 9])
     def test_the_phase_is_named(self, most: int) -> None:
         rng = np.random.default_rng(4)

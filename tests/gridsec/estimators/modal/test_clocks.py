@@ -57,9 +57,14 @@ def calm(_: int) -> None:
     """Nothing changes but the loads' own variations."""
 
 
-@pytest.mark.canary("4-8-2.0")
-@pytest.mark.parametrize(("seed", "count", "power_kw"), [(3, 4, 3.0), (4, 4, 3.0), (4, 8, 2.0)])
-def test_boilers_that_are_switched_together_name_no_meter(seed: int, count: int, power_kw: float) -> None:
+@pytest.mark.canary("4-8-2.0-90")
+@pytest.mark.parametrize(
+    ("seed", "count", "power_kw", "ticks"),
+    [(4, 8, 2.0, 90), (3, 4, 3.0, 200), (4, 4, 3.0, 200), (4, 8, 2.0, 200)],
+)
+def test_boilers_that_are_switched_together_name_no_meter(
+    seed: int, count: int, power_kw: float, ticks: int
+) -> None:
     """The meters of these customers are 10 s ahead, and show the common step after all others."""
     switched = np.random.default_rng(seed + 100).permutation(24)[:count]
     scene = Scene(24, seed, np.isin(np.arange(24), switched), 10)
@@ -67,9 +72,10 @@ def test_boilers_that_are_switched_together_name_no_meter(seed: int, count: int,
     def boilers(k: int) -> None:
         scene.street.p[switched] -= power_kw / BASE_KVA * (k // 60 % 2)
 
-    assert not np.any([each.suspects for each in scene.watch(200, boilers)])
+    assert not np.any([each.suspects for each in scene.watch(ticks, boilers)])
 
 
+@pytest.mark.canary("0-1-0.02", "1--1-0.02")
 @pytest.mark.parametrize(("shift", "step"), [(-1, 0.005), (-1, 0.02), (1, 0.005), (1, 0.02)])
 @pytest.mark.parametrize("seed", range(4))
 def test_a_meter_with_a_clock_within_half_a_tick_is_not_named(shift: int, step: float, seed: int) -> None:
@@ -93,8 +99,11 @@ def test_a_meter_with_a_clock_within_half_a_tick_is_not_named(shift: int, step: 
         assert not verdict.suspects.any()
 
 
-@pytest.mark.parametrize("customers", [(6,), (6, 8)])
-def test_metered_reactive_powers_of_another_moment_name_no_meter(customers: tuple[int, ...]) -> None:
+@pytest.mark.canary("customers0-100")
+@pytest.mark.parametrize(("customers", "ticks"), [((6,), 100), ((6,), 200), ((6, 8), 200)])
+def test_metered_reactive_powers_of_another_moment_name_no_meter(
+    customers: tuple[int, ...], ticks: int
+) -> None:
     """12 kW with a power factor that changes each minute, at customers with clocks that are ahead."""
     at = np.array(customers)
     scene = Scene(12, 3, np.isin(np.arange(12), at), 10)
@@ -103,9 +112,10 @@ def test_metered_reactive_powers_of_another_moment_name_no_meter(customers: tupl
     def factors(k: int) -> None:
         scene.street.tan[at] = 0.5 * (k // 60 % 2)
 
-    assert not np.any([each.suspects for each in scene.watch(200, factors)])
+    assert not np.any([each.suspects for each in scene.watch(ticks, factors)])
 
 
+@pytest.mark.canary("0.015")
 @pytest.mark.parametrize("size", [0.015, 0.02])
 def test_a_load_that_cycles_behind_an_offset_hides_no_lasting_manipulation(size: float) -> None:
     """0.6 kW for 2 s of 4 s at meter 3, with a clock that is ahead; meter 10 is off by `size`."""
@@ -121,6 +131,7 @@ def test_a_load_that_cycles_behind_an_offset_hides_no_lasting_manipulation(size:
     assert not np.any([np.delete(each.suspects, 10) for each in out])
 
 
+@pytest.mark.canary("2")
 @pytest.mark.parametrize("period", [1, 2, 4, 8])
 def test_an_offset_of_another_meter_delays_no_name_beyond_its_loads(period: int) -> None:
     """Meter 9 is off by 3 % with signs that alternate; no load of meter 3 explains as much."""

@@ -233,6 +233,7 @@ def test_meters_with_graded_amounts_contest_a_false_power_beside_a_meter() -> No
     assert all(some(10, 11)[each[:METERS]].sum() == 2 and not each[-1] for each in kept.replacing)
 
 
+@pytest.mark.canary("5")
 @pytest.mark.parametrize("seed", range(8))
 def test_accused_meters_with_the_reverse_sign_contest_others(seed: int) -> None:
     """Meters 0 to 3 read high, 3 by less: beside the others the honest 4 and 5 seem low, and so does 3."""

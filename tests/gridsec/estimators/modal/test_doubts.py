@@ -132,6 +132,13 @@ def test_the_estimate_is_the_gaussian_one() -> None:
     assert (wider >= variance - 1e-15).all()
 
 
+@pytest.mark.canary(
+    "columns0-True-1",
+    "columns0-False-1",
+    "columns1-True-1",
+    "columns1-False-1",
+    "columns0-False-20",
+)
 @pytest.mark.parametrize("ticks", [1, 20])
 @pytest.mark.parametrize("lasts", [True, False])
 @pytest.mark.parametrize("columns", [POWER * STEPS[:, [7, 3]], 0.1 * np.ones((12, 1))])

@@ -85,7 +85,7 @@ def test_a_restart_without_a_gap_continues_the_observer(seed: int) -> None:
     assert verdict.decision is Decision.CLEAN
 
 
-@pytest.mark.canary("1-2.0-0", "5-10.0-1", "20-60.0-2")
+@pytest.mark.canary("20-60.0-2")
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("tau", [2.0, 10.0, 60.0])
 @pytest.mark.parametrize("gap", [1, 2, 5, 20, 60, 120])

@@ -180,7 +180,7 @@ class TestWhatIsLearnedUnderDifficulties:
         assert not any(verdict.suspects[honest].any() for _, verdict in answers)
         return state, street
 
-    @pytest.mark.canary("0-p")
+    @pytest.mark.canary("0-v0_squared")
     @pytest.mark.parametrize("name", ["v0_squared", "p"])
     @pytest.mark.parametrize("seed", range(3))
     def test_time_in_which_little_is_known_does_not_count(self, name: str, seed: int) -> None:

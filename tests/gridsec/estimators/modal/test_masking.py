@@ -33,6 +33,7 @@ def lie(k: int) -> np.ndarray:
     return out
 
 
+@pytest.mark.canary("0.2")
 @pytest.mark.parametrize("share", [0.0, 0.2])
 def test_named_meters_are_masked_and_released(kernel: Core, share: float) -> None:
     """Each one is named alone; the first one is released after it agrees again, the second one is not."""
@@ -234,6 +235,7 @@ def test_meters_that_collude_within_a_wide_deviation_stay_masked(kernel: Core) -
     assert not masked.meters.any()
 
 
+@pytest.mark.canary("205-0.2")
 @pytest.mark.parametrize("share", [0.0, 0.2])
 @pytest.mark.parametrize("ticks", [205, 240])
 def test_a_replay_from_a_late_state_equals_one_from_the_first(kernel: Core, share: float, ticks: int) -> None:

@@ -18,14 +18,16 @@ from tests.gridsec.street import BASE_KVA, Street, make_plant
 EVERY, LIARS = 12, {2: 0.05, 5: -0.05}
 
 
-def test_nothing_is_remembered_of_frames_without_readings() -> None:
+@pytest.mark.canary("5")
+@pytest.mark.parametrize("count", [5, 8])
+def test_nothing_is_remembered_of_frames_without_readings(count: int) -> None:
     """What powers were not known while nobody was heard does not blind the readings that come."""
     plant = make_plant(np.random.default_rng(3), customers=9, drop=0.03)
     made, street = prepare(plant), Street(plant, np.random.default_rng(4), load_kw=1.0)
     wide = np.full(9, 20.0 / BASE_KVA)
     silent, state = tuple(range(9)), None
     named = []
-    for k in range(8 * EVERY):
+    for k in range(count * EVERY):
         heard = k % EVERY == 0
 
         def guessed(frame: Frame) -> Frame:

@@ -16,6 +16,7 @@ from tests.gridsec.estimators.modal.test_filter import masks, mixed, proportiona
 KINDS = ("outage", "half", "random", "alternating")
 
 
+@pytest.mark.canary("half-proportional", "alternating-mixed", "outage-busbar", "random-proportional")
 @pytest.mark.parametrize("make", [proportional, busbar, mixed])
 @pytest.mark.parametrize("kind", KINDS)
 def test_scores_and_means_equal_those_of_the_dense_filter(make: object, kind: str) -> None:

@@ -134,6 +134,7 @@ def test_manipulations_that_begin_one_after_another() -> None:
     assert core.adopt(kernel, state, suspicion) is state
 
 
+@pytest.mark.canary("1")
 @pytest.mark.parametrize("seed", range(3))
 def test_a_transition_that_ends_too_early_names_nothing(seed: int) -> None:
     """Four meters, one more at every other tick. The last one begins after a transition of four ticks."""
@@ -178,6 +179,7 @@ def until_passed(
     return k, state, over
 
 
+@pytest.mark.canary("0-1")
 @pytest.mark.parametrize(("seed", "length"), [(0, 1), (1, 4)])
 def test_readings_of_a_transition_that_has_passed_are_given_up(seed: int, length: int) -> None:
     """The filter is then the dense one with these readings as good as unknown, and nothing is suspected."""
@@ -233,7 +235,7 @@ def test_no_onset_after_a_misfit_explains_it() -> None:
 STEPS_OF_PLACES = np.vstack([np.zeros((1, 12)), STEPS])
 
 
-@pytest.mark.canary("complete-False", "random-True")
+@pytest.mark.canary("complete-False")
 @pytest.mark.parametrize(
     ("kind", "liar"), [("complete", False), ("random", True), ("complete", True), ("random", False)]
 )

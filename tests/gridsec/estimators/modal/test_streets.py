@@ -102,7 +102,9 @@ class TestLiars:
         _, answers = watch(street, design, 60, state=again, lies={4: 0.006})
         assert list(np.flatnonzero(answers[-1][1].suspects)) == [4]
 
-    def test_more_liars_than_can_be_told_apart_are_undecided(self) -> None:
+    @pytest.mark.canary("5")
+    @pytest.mark.parametrize("ticks", [5, 20])
+    def test_more_liars_than_can_be_told_apart_are_undecided(self, ticks: int) -> None:
         rng = np.random.default_rng(13)
         plant = make_plant(rng, customers=9, drop=0.02)
         design = prepare(plant)
@@ -111,7 +113,7 @@ class TestLiars:
         assert (design.max_attacked, narrow.max_attacked, narrow.observers) == (3, 1, 1)
         state, _ = watch(Street(plant, rng), narrow, 30)
         _, answers = watch(
-            Street(plant, rng, t=2000.0), narrow, 20, state=state, lies={1: 0.05, n - 2: -0.05}
+            Street(plant, rng, t=2000.0), narrow, ticks, state=state, lies={1: 0.05, n - 2: -0.05}
         )
         assert answers[-1][1].decision is Decision.UNDECIDED
         assert answers[-1][1].cause is Cause.TOO_MANY_SUSPECTS
