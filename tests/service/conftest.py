@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import math
 import os
 import secrets
@@ -36,7 +35,6 @@ from service.alarms.state_machine import (
     carry,
     conditions,
 )
-from service.api import routes
 from service.api.routes import ACCESS_THREADS, MAX_STREAMS, create_api
 from service.api.system import Probe
 from service.engine.commissioning import CommissioningProgress
@@ -382,23 +380,6 @@ class SmallService:
 
     def close(self) -> None:
         self.store.close()
-
-
-@pytest.fixture(scope="session", autouse=True)
-def description() -> Iterator[None]:
-    """Describe the routes once: every service of a process has the same, and a description takes 0.6 s."""
-    describe, made = routes._describe, list[str]()
-
-    def copied(app: FastAPI) -> None:
-        if made:
-            app.openapi = partial(json.loads, made[0])  # type: ignore[method-assign]
-        else:
-            describe(app)
-            made.append(json.dumps(app.openapi()))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(routes, "_describe", copied)
-        yield
 
 
 _FREE: list[FastAPI] = []
