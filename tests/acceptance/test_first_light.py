@@ -20,7 +20,7 @@ from tests.acceptance.live import Fleet, serve
 
 FEEDER = "simbench-lv-rural1"
 KINDS = ("bias", "scaling", "coordinated")
-DURATION_S = 300.0  # an attack ends after 210 s at the latest, and `modal` releases a meter after 60 readings
+DURATION_S = 300.0  # an attack ends after 210 s at the latest
 RUNS = [
     ("modal", 101, 120.0),  # the attack ends after 95 s
     *(("modal", seed, DURATION_S) for seed in range(6)),
