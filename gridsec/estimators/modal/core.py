@@ -603,6 +603,8 @@ class Suspicion:
         The best one explains the misfit since then, and better than errors alike within the classes.
     settled
         It explains nearly all of it.
+    beyond
+        Mean square of the whitened innovations that it leaves, at least 1.
     replacing : (q,) each
         Sets with colluding meters that have kept names, the latest ones first.
     """
@@ -612,6 +614,7 @@ class Suspicion:
     contested: Bools
     fits: bool = True
     settled: bool = True
+    beyond: float = 1.0
     replacing: tuple[Bools, ...] = field(default=(), repr=False)
 
     @property
@@ -665,7 +668,8 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     share = rivals.explained(state.rivals, found, age)
     fits = share >= EXPLAINED and not (age >= test.ticks and _aligned(core, found))
     found = found if fits else replace(found, named=np.zeros_like(found.named))
-    return Suspicion(rows[best], found, weighed.contested, fits, fits and share >= rivals.SETTLED, replacing)
+    settled, beyond = fits and share >= rivals.SETTLED, rivals.beyond(state.rivals, found, age)
+    return Suspicion(rows[best], found, weighed.contested, fits, settled, beyond, replacing)
 
 
 def _aligned(core: Core, found: Identification) -> bool:
@@ -872,7 +876,7 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     made, by = core.modes, core.estimator
     plain = estimates.honest(made, by, state.filter, state.static, loads=state.loads)
     if suspicion is None:
-        return plain
+        return replace(plain, beyond=rivals.beyond(state.rivals, None, 0))
     others = (
         estimates.honest(each.modes, by, each.filter, each.static, loads=each.loads)
         for each in state.rivals[1:]
@@ -882,4 +886,4 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     counted = found.weight >= estimates.COUNTED
     used = [found.chosen[counted & (found.model == model)].any(axis=0) for model in range(len(before))]
     T = [_moves(core, state, row, model, each) for model, each in enumerate(used)]
-    return estimates.corrected(before, T, found)
+    return replace(estimates.corrected(before, T, found), beyond=suspicion.beyond)

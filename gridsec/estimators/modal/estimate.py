@@ -21,6 +21,9 @@ Several explanations are mixed with their weights; their disagreement is part of
 are only as right as the model. An explanation of at least the weight `DOUBT` keeps meters from being named;
 it counts in the variance with at least the share `POSSIBLE`.
 
+Where no explanation fits, the model is wrong for some ticks. The stated variance is that of the model times
+the mean square of the innovations since the onset that the best explanation and chance leave, at least 1.
+
 References
 ----------
 Särkkä, Bayesian Filtering and Smoothing, 2013, A.1 (Gaussian conditioning).
@@ -106,11 +109,15 @@ class Estimated:
     rest : (t,) or None
         Residuals of the last tick less the means of w, b and the faults, squared pu; None without unknown
         directions.
+    beyond
+        Mean square of the whitened innovations that the explanations leave, at least 1: the errors have about
+        that variance, in the stated one.
     """
 
     mean: Floats
     spread: Callable[[], Floats] = field(repr=False)
     rest: Floats | None = None
+    beyond: float = 1.0
 
     @cached_property
     def variance(self) -> Floats:

@@ -649,7 +649,9 @@ def _estimate(
         checked=partial(checked, front, measured.frame),
         sigmas=front.sigmas,
     )
-    return Reconstructed.later(inputs, measured.frame.t, v2_bus, spread, tick.predicted.x), spread
+    # A named phase of the busbar is compared with the variance of an explained estimate.
+    stated = spread if errors.beyond == 1.0 else lambda: errors.beyond * spread()
+    return Reconstructed.later(inputs, measured.frame.t, v2_bus, stated, tick.predicted.x), spread
 
 
 def own_errors(design: ModalDesign, state: CoreState) -> Floats:

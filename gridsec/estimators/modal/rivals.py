@@ -507,6 +507,25 @@ def left(models: Sequence[Rival], found: Identification, age: int) -> float:
     return max(rest, 0.0) / model.misfit if model.misfit > 0.0 else inf
 
 
+def beyond(models: Sequence[Rival], found: Identification | None, age: int) -> float:
+    """Mean square of the whitened innovations that the best explanation and chance leave, at least 1.
+
+    It is that since the onset, under the model of the explanation: 1 where the stated variances are right.
+
+    Parameters
+    ----------
+    models, age
+        As in `explained`.
+    found
+        The explanations; None for none.
+    """
+    if not models:
+        return 1.0
+    model = models[0 if found is None else int(found.model[0])]
+    rest = model.misfit - model.chance - (0.0 if found is None else _gain(found, 0, model, age))
+    return 1.0 + max(rest, 0.0) / max(model.count, 1)
+
+
 def _gain(found: Identification, at: int, model: Rival, age: int) -> float:
     """Twice the logarithm of the likelihood's gain by an explanation, at its mean amounts.
 

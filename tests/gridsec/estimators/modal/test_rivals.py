@@ -122,10 +122,18 @@ def test_manipulations_that_begin_one_after_another() -> None:
         if k >= 206:
             suspicion = core.identify(kernel, state, evidence)
             alone.append(suspicion.fits)
+            if k == 206:
+                # The misfit that steps since one onset leave is variance; without them it is all of it.
+                open_, model = core.estimate(kernel, state), state.rivals[0]
+                squares = sum(each for each, _ in model.excess) - rivals.by_chance(model.count)
+                assert open_.beyond == pytest.approx(1.0 + squares / model.count)
+                assert open_.beyond > suspicion.beyond > 2.0
+                assert core.estimate(kernel, state, suspicion).beyond == suspicion.beyond
             after = core.transition(kernel, state, suspicion)
             if after is not state:
                 state, suspicion = after, core.identify(kernel, after, evidence)
             assert suspicion.fits
+            assert suspicion.beyond == 1.0
             assert (suspicion.found.named == liars).all()
     assert not alone[0]
     # The rival with the transition is followed.
