@@ -660,15 +660,15 @@ def identify(core: Core, state: CoreState, evidence: Evidence, before: Suspicion
     age = int(test.onsets.age[rows[best]])
     found = mirrors.reflected(found, core.near, state.masked.meters, known)
     replacing = () if before is None else before.replacing
-    left = rivals.left(state.rivals, found, age)
+    left = rivals.left(state.rivals, found)
     unread = unknown is not None and unknown.shape[1] >= UNREAD * core.modes.size
     weighed = collusion.weighed(found, state.masked.meters, core.near, left, replacing, unread=unread)
     sets = {each.tobytes(): each for each in (*weighed.replacing, *replacing)}
     found, replacing = weighed.found, tuple(sets.values())[:RECALLED]
-    share = rivals.explained(state.rivals, found, age)
+    share = rivals.explained(state.rivals, found)
     fits = share >= EXPLAINED and not (age >= test.ticks and _aligned(core, found))
     found = found if fits else replace(found, named=np.zeros_like(found.named))
-    settled, beyond = fits and share >= rivals.SETTLED, rivals.beyond(state.rivals, found, age)
+    settled, beyond = fits and share >= rivals.SETTLED, rivals.beyond(state.rivals, found)
     return Suspicion(rows[best], found, weighed.contested, fits, settled, beyond, replacing)
 
 
@@ -876,7 +876,7 @@ def estimate(core: Core, state: CoreState, suspicion: Suspicion | None = None) -
     made, by = core.modes, core.estimator
     plain = estimates.honest(made, by, state.filter, state.static, loads=state.loads)
     if suspicion is None:
-        return replace(plain, beyond=rivals.beyond(state.rivals, None, 0))
+        return replace(plain, beyond=rivals.beyond(state.rivals))
     others = (
         estimates.honest(each.modes, by, each.filter, each.static, loads=each.loads)
         for each in state.rivals[1:]

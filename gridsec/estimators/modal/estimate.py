@@ -324,16 +324,19 @@ class Spread:
         Variance of unknown directions, squared pu^2.
     places, least
         The busbar, and its least variance, squared pu^2; None for no limit.
+    scale
+        Factor of the variance of the errors, 1.
     """
 
     errors: Estimated
     more: Floats | float = 0.0
     places: slice | None = None
     least: Floats | float = 0.0
+    scale: float = 1.0
 
     def __call__(self) -> Floats:
         """The variance, (n,), squared pu^2."""
-        out = self.errors.variance + self.more
+        out = self.scale * self.errors.variance + self.more
         if self.places is not None:
             out[self.places] = np.maximum(out[self.places], self.least)
         return out

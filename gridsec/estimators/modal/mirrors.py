@@ -39,6 +39,8 @@ REFLECTED = 0.01
 """Weight from which on an explanation has mirror images, 1: that of reported explanations."""
 STAYS = 0.003
 """The same for sets of an earlier search, 1: an image does not vanish where its set loses some weight."""
+TOGETHER = 512
+"""Sets that are weighed together, 1: their columns have as many products with each other."""
 APART = 20.0
 """Cost of one amount in place of several from which on meters are not off alike, 1."""
 
@@ -180,8 +182,8 @@ def _of_laterals(
     level of all meters is unknown there.
     """
     p, b = near.phases.shape
-    own, inside, outside = sets[:, None, :p], near.laterals & read, ~near.laterals & read
-    few, others = (np.count_nonzero((each ^ own) | masked, axis=2) <= near.most for each in (inside, outside))
+    inside, outside = near.laterals & read, ~near.laterals & read
+    few, others = (_exchanged(sets[:, :p], each, masked) <= near.most for each in (inside, outside))
     busbar = np.logical_or.reduce(sets[:, -b:], axis=1)
     kept = _manipulated(sets, masked, b) <= near.most
     (row, at), (other, apart) = np.nonzero(few | ~busbar[:, None]), np.nonzero(kept[:, None] & others)
@@ -194,6 +196,16 @@ def _of_laterals(
     rest = sets[rows]
     rest[:, :p] &= ~accused
     return rows, rest, accused, others
+
+
+def _exchanged(sets: Bools, regions: Bools, masked: Bools) -> Floats:
+    """Numbers of meters of sets (k, p) in which the meters of regions (n, p) are exchanged, (k, n).
+
+    Masked meters count in any case.
+    """
+    own, other = (each[:, ~masked].astype(np.float64) for each in (sets, regions))
+    both = own.sum(axis=1)[:, None] + other.sum(axis=1) - 2.0 * own @ other.T
+    return np.asarray(both + np.count_nonzero(masked))
 
 
 def _manipulated(chosen: Bools, masked: Bools, phases: int) -> Ints:
@@ -222,8 +234,12 @@ class _Likelihood:
 
     def __call__(self, rows: Ints, rest: Bools, columns: Bools) -> Floats:
         """L of parts (n, q) of sets `rows` (n,) with meters `columns` (n, p) that have one amount, (n,)."""
-        counted = self.counted[:, rows]
-        return self._mean(self._each(rest, columns, counted[1]), counted)
+        counted, out = self.counted[:, rows], np.empty(rows.size)
+        for first in range(0, rows.size, TOGETHER):
+            part = slice(first, first + TOGETHER)
+            each = self._each(rest[part], columns[part], counted[1, part])
+            out[part] = self._mean(each, counted[:, part])
+        return out
 
     def _each(self, sets: Bools, columns: Bools, alike: Bools) -> Floats:
         """L with independent amounts, and with amounts alike where these count, (2, n).

@@ -650,7 +650,7 @@ def _estimate(
         sigmas=front.sigmas,
     )
     # A named phase of the busbar is compared with the variance of an explained estimate.
-    stated = spread if errors.beyond == 1.0 else lambda: errors.beyond * spread()
+    stated = replace(spread, scale=errors.beyond)
     return Reconstructed.later(inputs, measured.frame.t, v2_bus, stated, tick.predicted.x), spread
 
 

@@ -114,6 +114,8 @@ class Rival:
         Variance of the loads' errors that vary, without any reading, in those of the model, 1.
     transition
         First ticks since the onset at which every reading is unknown.
+    older
+        Ticks of the onset before the kept readings.
     """
 
     modes: Modes
@@ -132,6 +134,7 @@ class Rival:
     update: Update | None = None
     loads: float = 1.0
     transition: int = 0
+    older: int = 0
 
     @property
     def chance(self) -> float:
@@ -242,7 +245,8 @@ def replayed(
     one = signatures.empty(modes, int(not onsets.ramp[row]), int(onsets.ramp[row]))
     if older and (state.full is None or exactly is not None):
         begin, one = -1, signatures.single(had, row)
-    out = [replace(each, onsets=one, suspected=exactly) for each in first(modes, others, history)]
+    start = first(modes, others, history)
+    out = [replace(each, onsets=one, suspected=exactly, older=max(0, age - count)) for each in start]
     for k, reading in enumerate(history.readings):
         out = followed(out, *reading, begun=k == begin)
     return tuple(out)
@@ -465,7 +469,7 @@ def _jumped(modes: Modes, state: FilterState, gap: Interval, size: float) -> Fil
 # --- Explanations ---
 
 
-def explained(models: Sequence[Rival], found: Identification, age: int) -> float:
+def explained(models: Sequence[Rival], found: Identification) -> float:
     """Share of the misfit beyond chance that the best explanation takes away, 1.
 
     The model is that of the loads, a steady rival, or from `SETTLED` on a transition.
@@ -474,8 +478,8 @@ def explained(models: Sequence[Rival], found: Identification, age: int) -> float
     ----------
     models
         The model and its rivals; none: all of it.
-    found, age
-        The explanations, and the age of their onset, ticks.
+    found
+        The explanations.
     """
     best = 0.0 if models else 1.0
     for at in dict.fromkeys((0, int((found.model == 0).argmax()))) if models else ():
@@ -483,7 +487,7 @@ def explained(models: Sequence[Rival], found: Identification, age: int) -> float
         if model.transition and not any_of(found.chosen[at]):
             continue
         beyond = model.misfit - model.chance
-        share = _gain(found, at, model, age) / beyond if beyond > 0.0 else 1.0
+        share = _gain(found, at, model) / beyond if beyond > 0.0 else 1.0
         if model.transition and share < SETTLED:
             # The names are those of its sets.
             return 0.0
@@ -492,29 +496,29 @@ def explained(models: Sequence[Rival], found: Identification, age: int) -> float
     return best
 
 
-def left(models: Sequence[Rival], found: Identification, age: int) -> float:
+def left(models: Sequence[Rival], found: Identification) -> float:
     """Largest share of the misfit that the best explanation may leave: that which it leaves, and chance.
 
     Parameters
     ----------
-    models, found, age
+    models, found
         As in `explained`.
     """
     if not models:
         return inf
     model = models[int(found.model[0])]
-    rest = model.misfit + model.chance - _gain(found, 0, model, age)
+    rest = model.misfit + model.chance - _gain(found, 0, model)
     return max(rest, 0.0) / model.misfit if model.misfit > 0.0 else inf
 
 
-def beyond(models: Sequence[Rival], found: Identification | None, age: int) -> float:
+def beyond(models: Sequence[Rival], found: Identification | None = None) -> float:
     """Mean square of the whitened innovations that the best explanation and chance leave, at least 1.
 
     It is that since the onset, under the model of the explanation: 1 where the stated variances are right.
 
     Parameters
     ----------
-    models, age
+    models
         As in `explained`.
     found
         The explanations; None for none.
@@ -522,14 +526,16 @@ def beyond(models: Sequence[Rival], found: Identification | None, age: int) -> f
     if not models:
         return 1.0
     model = models[0 if found is None else int(found.model[0])]
-    rest = model.misfit - model.chance - (0.0 if found is None else _gain(found, 0, model, age))
+    rest = model.misfit - model.chance - (0.0 if found is None else _gain(found, 0, model))
     return 1.0 + max(rest, 0.0) / max(model.count, 1)
 
 
-def _gain(found: Identification, at: int, model: Rival, age: int) -> float:
+def _gain(found: Identification, at: int, model: Rival) -> float:
     """Twice the logarithm of the likelihood's gain by an explanation, at its mean amounts.
 
-    Of an onset before the kept readings, a gain in proportion to their number.
+    Of an onset before the kept readings, a gain in proportion to the ticks of the misfit. An explanation
+    since an onset before that of the misfit gains little in between.
     """
     problem, chosen = found.problems[int(found.model[at])], found.chosen[at]
-    return float(problem.y[chosen] @ mean_amounts(problem, chosen)) * min(1.0, model.ticks / age)
+    share = model.ticks / max(1, model.ticks + model.older)
+    return float(problem.y[chosen] @ mean_amounts(problem, chosen)) * share

@@ -277,7 +277,9 @@ def explanations(
     # Inverters with a metered reactive power, and their customers' reports.
     metered = uses_q[owner]
     inverters, wrong = found.chosen[:, p + last : p + powers], found.chosen[:, p : p + last].copy()
-    wrong[:, owner[metered]] |= inverters[:, metered]
+    for inverter in np.flatnonzero(metered):
+        # A customer may have several inverters.
+        wrong[:, owner[inverter]] |= inverters[:, inverter]
     busbar = np.zeros((len(wrong), phases), dtype=np.bool_)
     busbar[:, used] = found.chosen[:, p + powers :]
     every = np.hstack([found.chosen[:, :p], inverters & ~metered, wrong, busbar])
