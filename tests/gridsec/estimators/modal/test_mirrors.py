@@ -59,8 +59,11 @@ def of_column(given: SearchProblem, rest: Bools, column: Bools, share: float) ->
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_likelihoods_of_parts_of_a_set_with_a_column_are_exact(seed: int) -> None:
+def test_likelihoods_of_parts_of_a_set_with_a_column_are_exact(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Both priors, parts with few meters and none, columns inside and outside of the set, and no column."""
+    monkeypatch.setattr(mirrors, "TOGETHER", (6, 512)[seed % 2])
     random = np.random.default_rng(seed)
     given = replace(problem(4 + seed, p=9, others=3), std=random.uniform(0.5, 2.0, 12))
     chosen = np.isin(np.arange(12), (0, 2, 3, 5, 6, 9, 11))
@@ -79,6 +82,15 @@ def test_likelihoods_of_parts_of_a_set_with_a_column_are_exact(seed: int) -> Non
         each = np.array([of_column(given, one, column, share) for share in (0.0, ALIKE)])
         assert found == pytest.approx(float(mean_likelihood(each[counted])), abs=1e-7)
     assert likelihood(of[:0], rest[:0], columns[:0]).shape == (0,)
+
+
+def test_numbers_of_exchanged_meters_are_those_of_the_sets() -> None:
+    random = np.random.default_rng(2)
+    sets, regions, masked = random.random((7, 11)) < 0.4, random.random((5, 11)) < 0.5, np.arange(11) > 8
+    found = mirrors._exchanged(sets, regions, masked)
+    for k, one in enumerate(sets):
+        for n, region in enumerate(regions):
+            assert found[k, n] == np.count_nonzero((one ^ region) | masked)
 
 
 def test_a_prior_that_is_far_worse_for_a_set_does_not_count_for_its_images() -> None:

@@ -240,6 +240,26 @@ def test_no_onset_after_a_misfit_explains_it() -> None:
     assert one.before(36) == pytest.approx(sum(each for each, _ in one.excess[:4]) - rivals.by_chance(48))
 
 
+def test_a_ramp_since_an_onset_before_that_of_the_misfit_explains_it() -> None:
+    """Two meters drift; the misfit of the models begins with a later step."""
+    kernel = core.assemble(MODEL, STEPS_OF_PLACES, np.full(12, 0.1), gamma=1e6)
+    source, state = Source(MODEL, np.random.default_rng(0)), core.init(kernel, 0.0)
+    liars, older = np.isin(np.arange(12), (4, 9)), 0
+    for k in range(240):
+        m = source.tick() + 0.001 * max(0, k - 199) * liars
+        state, evidence = core.step(kernel, state, float(k), m)
+        if k < 215 or not core.alarmed(kernel, evidence):
+            continue
+        suspicion = core.identify(kernel, state, evidence)
+        age = int(state.detector.onsets.age[suspicion.row])
+        if suspicion.found.model[0] == 0 and age > state.rivals[0].ticks + 4:
+            older += 1
+            assert (suspicion.found.chosen[0, :12] == liars).all()
+            assert suspicion.settled
+            assert suspicion.beyond < 3.0
+    assert older >= 2
+
+
 STEPS_OF_PLACES = np.vstack([np.zeros((1, 12)), STEPS])
 
 
