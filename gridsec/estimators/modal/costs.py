@@ -81,12 +81,6 @@ def penalties(meters: int) -> Floats:
     return frozen(np.concatenate([[0.0], np.cumsum(more)]))
 
 
-def penalty(problem: SearchProblem, chosen: Bools) -> float:
-    """Penalty of one set, (q,)."""
-    count = int(np.count_nonzero(chosen[: problem.meters]))
-    return float(penalties(problem.meters)[count] + problem.charge[chosen].sum())
-
-
 def informed(problem: SearchProblem) -> Bools:
     """Meters with readings since the onset, (p,): the information about others is zero."""
     return np.asarray(problem.F.diagonal()[: problem.meters] > np.finfo(np.float64).tiny)
@@ -282,9 +276,14 @@ def explained(problem: SearchProblem, sets: Bools, weight: Floats, T: Floats) ->
     return mean, variance
 
 
-def mean_likelihood(each: Floats) -> Floats:
-    """Costs of the mean of the likelihoods, (...); `each` has the costs of one likelihood per row."""
-    return np.asarray(-2.0 * (np.logaddexp.reduce(-0.5 * each, axis=0) - log(len(each))))
+def mean_likelihood(each: Floats, counted: Bools | None = None) -> Floats:
+    """Costs of the mean of the likelihoods, (...); `each` has the costs of one likelihood per row.
+
+    counted: likelihoods that count, in the shape of `each`; None: all.
+    """
+    counted = np.ones(each.shape, dtype=np.bool_) if counted is None else counted
+    log_sum = np.logaddexp.reduce(np.where(counted, -0.5 * each, -inf), axis=0)
+    return np.asarray(-2.0 * (log_sum - np.log(np.count_nonzero(counted, axis=0))))
 
 
 def among(problem: SearchProblem, used: Bools) -> SearchProblem:

@@ -25,12 +25,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import product
 from math import inf
 
 import numpy as np
 
 from gridsec.arrays import Bools, Floats, Ints, any_of, keys_of
-from gridsec.estimators.modal.costs import SearchProblem, among, costs, informed, penalties
+from gridsec.estimators.modal.costs import SearchProblem, among, costs, informed, mean_likelihood, penalties
 from gridsec.estimators.modal.laterals import clusters, coded
 from gridsec.estimators.modal.model import Modes
 from gridsec.estimators.modal.search import ALIKE, Identification, costs_of, extended
@@ -114,7 +115,7 @@ def _images(
     """Mirror images of each of some sets (k, q), and their costs beyond its own."""
     read, (p, b) = informed(problem), near.phases.shape
     likelihood, out = _Likelihood(problem, sets), list[list[tuple[Bools, float]]]([] for _ in sets)
-    phases = [one for k, each in enumerate(sets) for one in _of_phases(problem, each, k, near, read, masked)]
+    phases = list(_of_phases(problem, sets, near, read, masked))
     rows, parts, inside, outside = _of_laterals(sets, near, read, masked)
     # One amount of the meters that are off, in place of theirs.
     at = np.concatenate([np.array([k for k, *_ in phases], dtype=np.intp), rows])
@@ -138,13 +139,14 @@ def _images(
     return out
 
 
-def _of_phases(  # noqa: PLR0917  # one set, and what its images depend on
-    problem: SearchProblem, chosen: Bools, k: int, near: Neighbourhoods, read: Bools, masked: Bools
+def _of_phases(
+    problem: SearchProblem, sets: Bools, near: Neighbourhoods, read: Bools, masked: Bools
 ) -> Iterator[tuple[int, Bools, float, Bools]]:
-    """Number of the set, its images by phases of the busbar, their charges, and the meters off in both."""
+    """Number of a set, its image by a phase of the busbar, the charge of that, and the meters off in both."""
     p, b = near.phases.shape
     laterals = (near.laterals & read).astype(np.float64)
-    for phase in range(b):
+    for k, phase in product(range(len(sets)), range(b)):
+        chosen = sets[k]
         image, column = _of_phase(chosen, near, phase, read, masked)
         if image is None:
             continue
@@ -230,7 +232,7 @@ class _Likelihood:
         self.problem, every = problem, np.ones(len(sets), dtype=np.bool_)
         each = self._each(sets, np.zeros((len(sets), problem.meters), dtype=np.bool_), every)
         self.counted = each <= each.min(axis=0) + APART
-        self.own = self._mean(each, self.counted)
+        self.own = mean_likelihood(each, self.counted)
 
     def __call__(self, rows: Ints, rest: Bools, columns: Bools) -> Floats:
         """L of parts (n, q) of sets `rows` (n,) with meters `columns` (n, p) that have one amount, (n,)."""
@@ -238,7 +240,7 @@ class _Likelihood:
         for first in range(0, rows.size, TOGETHER):
             part = slice(first, first + TOGETHER)
             each = self._each(rest[part], columns[part], counted[1, part])
-            out[part] = self._mean(each, counted[:, part])
+            out[part] = mean_likelihood(each, counted[:, part])
         return out
 
     def _each(self, sets: Bools, columns: Bools, alike: Bools) -> Floats:
@@ -268,9 +270,3 @@ class _Likelihood:
         if several.size:
             out[1, several] = costs(few, sets[several], ALIKE)
         return np.asarray(out - own)
-
-    @staticmethod
-    def _mean(each: Floats, counted: Bools) -> Floats:
-        """Costs of the mean of the likelihoods that count, (n,)."""
-        log_sum = np.logaddexp.reduce(np.where(counted, -0.5 * each, -inf), axis=0)
-        return np.asarray(-2.0 * (log_sum - np.log(np.count_nonzero(counted, axis=0))))

@@ -285,7 +285,7 @@ def explanations(
     every = np.hstack([found.chosen[:, :p], inverters & ~metered, wrong, busbar])
     _, first, which = np.unique(np.packbits(every, axis=1), axis=0, return_index=True, return_inverse=True)
     total = np.bincount(which.ravel(), found.weight)
-    likely = sorted((k for k in np.flatnonzero(total >= LIKELY)), key=lambda k: (-total[k], first[k]))
+    likely = sorted(np.flatnonzero(total >= LIKELY).tolist(), key=lambda k: (-total[k], first[k]))
     parts = np.cumsum([p, owner.size, last])
     out = []
     for k in likely[:SHOWN]:
